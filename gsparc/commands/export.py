@@ -70,6 +70,7 @@ def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
 
 
 def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
+    predictor.site.need_phase("to=taps")
     place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:
         raise SettingError(f"table={config.table}: no column time_s [s]")

@@ -50,7 +50,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
-    figure = DECIDING[data.site.kind]
+    figure = DECIDING[data.site.scored]
     pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:

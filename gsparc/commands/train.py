@@ -27,7 +27,7 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.files import is_address, set_aside
 from gsparc.data.instantiate import find, node_of, suggest
 from gsparc.data.load import datamodule, split_for
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
@@ -183,7 +183,7 @@ def _check(
     Raises:
         ValueError: an objective, a file of walls, a split, weights to start from or a resume that cannot be.
     """
-    objective_of(config, data.site.kind)
+    objective_of(config, data.site.scored)
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
     for topic, sentence in in_short(data, split):
@@ -284,7 +284,7 @@ def _draw(
         tracking.picture(loggers, "found", run_dir / "found.png")
 
 
-def objective_of(config: DictConfig, kind: Kind) -> str:
+def objective_of(config: DictConfig, kind: Scored) -> str:
     """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
 
     Raises:
@@ -315,7 +315,7 @@ def task(config: DictConfig) -> float:
 def _train_and_show(config: DictConfig) -> float:
     run_dir = run_directory()
     facts, objects = train(config, run_dir)
-    figure = objective_of(config, objects.data.site.kind)
+    figure = objective_of(config, objects.data.site.scored)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
     results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
     show(run_dir, results, lines=summary.remarks(facts, config.eval_on))

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.data.checks import outliers
+from gsparc.data.checks.coherence import allowed
 from gsparc.data.limits import check_arguments, whole
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
@@ -126,6 +127,8 @@ class DataModule(pl.LightningDataModule, ABC):
         SettingError: a batch without rows.
     """
 
+    free = "auto"  # `dataset.align`: what of each row's factor is free
+
     def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()
         check_arguments(locals(), batch_size=whole(1))
@@ -144,7 +147,7 @@ class DataModule(pl.LightningDataModule, ABC):
     @cached_property
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
-        data = self.load()
+        data = allowed(self.load(), self.free)
         for warning in outliers.warnings(data):
             log.warning("%s: %s", self.name, warning)
         return data

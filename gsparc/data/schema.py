@@ -14,11 +14,13 @@ from gsparc.data.blocks import take
 from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
+from gsparc.physics.row_factors import Freedom, words
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
 Kind = Literal["spectrum", "csi", "rssi"]
+Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
@@ -111,6 +113,9 @@ class Site:
             of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
         unit: that powers were given in, and are answered in; None: `level_unit`.
+        freedom: what of each row's factor nobody knows, see `gsparc.physics.row_factors`.
+        gauge: of rows that were turned to each other: `carrier`, their phases over places are those of
+            waves; `free`, neighbours were made alike. None where rows are as measured.
     """
 
     name: str
@@ -137,6 +142,18 @@ class Site:
     georeference: Georeference | None = None
     level_unit: str = "dB"
     unit: str | None = None
+    freedom: Freedom = "none"
+    gauge: Literal["carrier", "free"] | None = None
+
+    @property
+    def scored(self) -> Scored:
+        """The figures of merit that tell of it; rows with factors of their own are aligned first."""
+        return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
+
+    def need_phase(self, what: str) -> None:
+        """`ValueError` where rows have phases of their own, so that `what` cannot be told."""
+        if self.freedom != "none":
+            raise ValueError(f"{what}: channels are known up to {words(self.freedom)} of each row")
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
+from gsparc.models import parts
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links, trained_stations
 from gsparc.models.registry import method_class
@@ -71,7 +72,7 @@ def baseline(
     for number, fold in enumerate(before.folds):
         method = for_links(method_class(name), own)
         known = replace(fold, val=fold.val[:0]) if unseen else fold
-        report = method.fit(own, known, FitContext(Path()))
+        report = parts.fit(method, own, known, FitContext(Path()))
         for note in report.notes:
             log.info("fold %d: %s", number, note)
         methods.append(method)

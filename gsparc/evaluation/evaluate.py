@@ -175,10 +175,11 @@ def latencies(
 
 def dataset_facts(data: Measurements) -> dict[str, Any]:
     """`dataset/*`."""
-    names = ("name", "kind", "sha256", "stand_in", "convergence_error")
+    names = ("name", "sha256", "stand_in", "convergence_error", "freedom")
     seconds = data.provenance.get("simulate_s")
     return {
         **{f"dataset/{name}": getattr(data.site, name) for name in names},
+        "dataset/kind": data.site.scored,
         "dataset/identity": identity(data),
         "dataset/rows": len(data),
         "dataset/simulate_s": None if seconds is None else float(seconds),

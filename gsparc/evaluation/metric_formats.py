@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ FIGURES = {
     "mse": Figure("MSE", ".3g", "ratio"),
     "mae": Figure("MAE", ".3g", "smaller"),
     "nmse": Figure("NMSE", ".3g", "ratio"),
+    "nmse_aligned": Figure("NMSE, rows aligned", ".3g", "ratio"),
+    "tone_rmse_db": Figure("RMSE of tones dB", ".2f", "smaller"),
     "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
     "snr_db": Figure("SNR dB", ".2f"),
     "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
@@ -39,14 +41,20 @@ FIGURES = {
     "error_db": Figure("error dB", ".2f", "smaller"),
     "skill": Figure("skill", ".3f"),
 }
-TABLES: dict[Kind, tuple[str, ...]] = {
+TABLES: dict[Scored, tuple[str, ...]] = {
     "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
     "csi": ("nmse", "nmse_scalar", "snr_db"),
+    "aligned csi": ("nmse_aligned", "tone_rmse_db", "snr_db"),
     "rssi": ("rmse_db", "mae_db"),
 }
 """The columns of a kind's tables; methods, fronts and effects are compared by the first."""
-DECIDING: dict[Kind, str] = {kind: names[0] for kind, names in TABLES.items()}
-PER_SAMPLE: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": "error_db"}
+DECIDING: dict[Scored, str] = {kind: names[0] for kind, names in TABLES.items()}
+PER_SAMPLE: dict[Scored, str] = {
+    "spectrum": "psnr_db",
+    "csi": "snr_db",
+    "aligned csi": "snr_db",
+    "rssi": "error_db",
+}
 """The figure of a single sample, in decibels."""
 
 

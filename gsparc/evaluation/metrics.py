@@ -17,7 +17,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,9 @@ class ChannelMetrics(SampleMetric):
     `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
     """
 
-    quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db")
+    quantities: tuple[str, ...] = (
+        "error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db",
+    )  # fmt: skip
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         # In stored units, which are near 1: fourth powers of 1e-90 or 1e90 under- or overflow.
@@ -158,6 +160,31 @@ class ChannelMetrics(SampleMetric):
             "silent_samples": silent,
             "samples": len(samples["mse"]),
         }
+
+
+class AlignedChannelMetrics(ChannelMetrics):
+    """Channels whose rows have factors of their own, predictions turned to each row by what is free of it.
+
+    `tone_rmse_db` is the error of levels at single subcarriers and antennas.
+    """
+
+    quantities: tuple[str, ...] = (*ChannelMetrics.quantities, "tone_db2")
+
+    def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
+        p, t = (x.abs().double().flatten(1).numpy() for x in (prediction, target))
+        known = t > 0 if mask is None else (t > 0) & mask.flatten(1).numpy()
+        floor = SILENCE**0.5 * np.where(known, t, 1.0)
+        decibels = 20 * np.log10(np.maximum(p, floor) / np.where(known, t, 1.0))
+        squares = np.where(known, decibels**2, 0).sum(1) / _nonzero(known.sum(1))
+        return {**super()._score(prediction, target, mask), "tone_db2": squares}
+
+    @staticmethod
+    def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
+        """See the base class."""
+        figures = ChannelMetrics.summary(samples)
+        aligned, squares = figures.pop("nmse"), _statistic(samples["tone_db2"])
+        tones = None if squares is None else float(np.sqrt(squares))
+        return {"nmse_aligned": aligned, "tone_rmse_db": tones, **figures}
 
 
 class PowerMetrics(SampleMetric):
@@ -202,15 +229,21 @@ class PowerMetrics(SampleMetric):
         }
 
 
-def metrics_for(kind: Kind, scale: float = 1.0) -> SampleMetric:
-    """The metrics of a dataset kind; `scale` is `Site.target_scale`."""
-    return {"spectrum": SpectrumMetrics, "csi": ChannelMetrics, "rssi": PowerMetrics}[kind](scale)
+METRICS: dict[Scored, type[SampleMetric]] = {
+    "spectrum": SpectrumMetrics, "csi": ChannelMetrics, "aligned csi": AlignedChannelMetrics,
+    "rssi": PowerMetrics,
+}  # fmt: skip
 
 
-def figure_names(kind: Kind) -> tuple[str, ...]:
+def metrics_for(kind: Scored, scale: float = 1.0) -> SampleMetric:
+    """The metrics of what a site is scored by (`Site.scored`); `scale` is `Site.target_scale`."""
+    return METRICS[kind](scale)
+
+
+def figure_names(kind: Scored) -> tuple[str, ...]:
     """The figures of merit that a dataset kind is told by."""
-    shape = {"spectrum": (1, 16, 16), "csi": (1, 1, 2), "rssi": (1, 1)}[kind]
-    one = torch.ones(shape, dtype=torch.complex64 if kind == "csi" else torch.float32)
+    shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
+    one = torch.ones(shape, dtype=torch.complex64 if kind.endswith("csi") else torch.float32)
     metric = metrics_for(kind)
     metric.update(one, one)
     counts = ("samples", "silent_samples")

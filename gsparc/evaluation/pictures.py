@@ -11,7 +11,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.sector_levels import draw_sector_levels
-from gsparc.models.method import Method
+from gsparc.models.method import Method, predictions
 
 SPECTRA = 4  # test rows drawn
 
@@ -21,16 +21,18 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     spectra = data.site.kind == "spectrum"
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
-    batch = data.batch(rows)
-    prediction = method.predict(batch)
-    true, predicted = batch.target.numpy(), prediction.mean.numpy()
+    told = list(predictions(method, data, rows))
+    back = np.argsort(np.concatenate([chosen for chosen, _, _ in told]))
+    true = np.concatenate([batch.target.numpy() for _, batch, _ in told])[back]
+    predicted = np.concatenate([said.mean.numpy() for _, _, said in told])[back]
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
-    confidence = None if prediction.confidence is None else prediction.confidence.numpy()
+    known = [said.confidence for _, _, said in told]
+    confidence = None if known[0] is None else np.concatenate([one.numpy() for one in known])[back]
     return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
 from gsparc.models.method import Method, predictions
@@ -26,13 +26,13 @@ class Scores:
     """Results of one method, sample by sample, in the order of the folds.
 
     Attributes:
-        kind: of the dataset.
+        kind: see `Site.scored`.
         fold, row: (S,) int64.
         samples: quantities of the metrics of `kind`, (S,) float64 each.
         confidence, variance: (S,) float64, NaN where the method gives none.
     """
 
-    kind: Kind
+    kind: Scored
     fold: np.ndarray
     row: np.ndarray
     samples: dict[str, np.ndarray]
@@ -108,7 +108,7 @@ def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
 
 def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     """Numbers (R,) of runs with channels among the rows `eval_on` and none among those learned from."""
-    if data.site.kind != "csi" or data.run is None:
+    if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
     learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
     return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
@@ -153,7 +153,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     for method, rows, fold in zip(methods, every, split.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         turn = best_phases(method, data, rows, runs) if len(runs) else None
-        metric = metrics_for(data.site.kind, data.site.target_scale)
+        metric = metrics_for(data.site.scored, data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
         order = []
         for chosen, batch, prediction in predictions(method, data, rows, CHUNK):
@@ -168,7 +168,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         confidence.append(outputs["confidence"])
         variance.append(outputs["variance"])
     return Scores(
-        kind=data.site.kind,
+        kind=data.site.scored,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
         row=np.concatenate(every),
         samples={name: np.concatenate([s[name] for s in samples]) for name in samples[0]},

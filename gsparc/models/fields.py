@@ -16,6 +16,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels import field as channels
 from gsparc.models.channels import initial as waves
+from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.directional.method import DirectionalGP
@@ -23,7 +24,7 @@ from gsparc.models.image_sources.known.images import counted
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
-from gsparc.models.method_field import ProcessField
+from gsparc.models.method_field import AlignedField, ProcessField
 from gsparc.models.mixture.mixture import Mixture, residuals
 from gsparc.models.moving_array.bearing_field import BearingField
 from gsparc.models.moving_array.method import MovingArrayField
@@ -141,6 +142,15 @@ def process(
     return ProcessField(method), report
 
 
+def aligned(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """A process of two lengths on rows that were turned to each other; `init` and `clutter` mean nothing."""
+    method = ComplexGP()
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return AlignedField(method), report
+
+
 def _completed(
     method: ImageSourceGP, data: Measurements, rows: np.ndarray, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
@@ -180,6 +190,7 @@ INITIALISERS: dict[str, Callable[..., tuple[ConditionalField, FitReport]]] = {
     "joint_powers": joint_powers,
     "bearings": bearings,
     "process": process,
+    "aligned": aligned,
 }
 # `(site, state) -> field` by the kind that a state names.
 RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
@@ -190,6 +201,7 @@ RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {
     "joint_powers": joint_field.restored,
     "bearings": BearingField.restored,
     "process": ProcessField.restored,
+    "aligned": AlignedField.restored,
 }
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.moments import Snapshots
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.physics.row_factors import turning
 from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
@@ -164,12 +166,28 @@ def predictions(
     """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
 
     One station after the other: each may have a model of its own, whose matrices are read for every batch.
+    Where rows have factors of their own (`Site.freedom`), answers are turned to what was measured.
     """
     order = np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
-    for start in range(0, len(rows), size):
-        chosen = order[start : start + size]
-        batch = data.batch(rows[chosen])
-        yield chosen, batch, method.predict(batch)
+
+    def asked() -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
+        for start in range(0, len(rows), size):
+            chosen = order[start : start + size]
+            batch = data.batch(rows[chosen])
+            yield chosen, batch, method.predict(batch)
+
+    if data.site.freedom == "none":
+        yield from asked()
+        return
+    told = list(asked())
+    moments, back = Snapshots.of(data, rows), np.argsort(order)
+    means = moments.arranged(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
+    turns = turning(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    factors = torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
+    for chosen, batch, said in told:
+        factor = factors[chosen]
+        variance = None if said.variance is None else said.variance * factor[:, 0].abs().square().mean(1)
+        yield chosen, batch, replace(said, mean=said.mean * factor, variance=variance)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.conditional import ConditionalField, LeftOutRows
 from gsparc.models.method import Method, Prediction
 from gsparc.training.context import FitContext
@@ -67,5 +68,14 @@ class ProcessField(MethodField):
 
     kind = "process"
     makes = GaussianProcess
+    count = 0  # type: ignore[assignment]
+    terms = ("residual",)  # type: ignore[assignment]
+
+
+class AlignedField(MethodField):
+    """A process of rows that were turned to each other, without any Gaussians."""
+
+    kind = "aligned"
+    makes = ComplexGP
     count = 0  # type: ignore[assignment]
     terms = ("residual",)  # type: ignore[assignment]

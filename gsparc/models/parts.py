@@ -22,10 +22,12 @@ from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
+from gsparc.models.aligned_rows import in_one_gauge
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
+from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +57,9 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
     Raises:
         ValueError: the folder holds a part of other data, rows, seed or settings.
     """
-    left = context.resume
+    budget = TimeBudget()
+    data, left = in_one_gauge(data, fold), context.resume
+    aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count("*")
     if left is not None and left.is_dir():
@@ -64,7 +68,8 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         if not method.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
-    return method.fit(data, fold, context)
+    report = method.fit(data, fold, context)
+    return replace(report, seconds=report.seconds + aligning) if aligning else report
 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.checks.coherence import allowed
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.models import checkpoint
+from gsparc.models import checkpoint, parts
 from gsparc.models.per_station import for_links
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
@@ -29,7 +30,8 @@ VALIDATED = SplitSettings().val_fraction
 def fit(
     rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
     unit: str = "dBm", model: str = "gsparc", effort: float = 1.0, budget_s: float | None = None,
-    seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None, **arrays: Any,
+    seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None,
+    align: str = "auto", **arrays: Any,
 ) -> Predictor:  # fmt: skip
     """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
 
@@ -51,6 +53,8 @@ def fit(
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
         settings: arguments of the model's class.
+        align: what of each row's factor is free in channels: `none`, `phase`, `phase+delay` or
+            `phase+delay+gain`; `auto`: as neighbouring rows say.
         **arrays: anything else of the schema of `docs/reference/schema.md`: `carrier_hz`, `frequency_hz`,
             `array_position`, `station_position`, ...
 
@@ -65,12 +69,12 @@ def fit(
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
         raise DataError("; ".join(dict.fromkeys(refused.problems))) from None
-    data = reading.data
+    data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
     method = for_links(partial(method_class(model), **(settings or {})), data)
     fold = _learned_from(data, VALIDATED if method.takes_budget else 0.0, seed)
-    report = method.fit(data, fold, FitContext(seed=seed, effort=effort, budget_s=budget_s))
+    report = parts.fit(method, data, fold, FitContext(seed=seed, effort=effort, budget_s=budget_s))
     for note in report.notes:
         log.info("%s", note)
     if save is not None:

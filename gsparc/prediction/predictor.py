@@ -19,6 +19,7 @@ from gsparc.models.method import Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, mapped, transforming
+from gsparc.physics.row_factors import words
 from gsparc.prediction.confidence import Trusted
 from gsparc.prediction.query import Queries, read_places, usual_heights
 from gsparc.prediction.timing import Call
@@ -85,6 +86,12 @@ class Predictor:
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
             f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
         )
+
+    @property
+    def known(self) -> str:
+        """What answers are known up to: rows of channels may have had factors of their own."""
+        free = self.site.freedom
+        return "all" if free == "none" else f"up to {words(free)} of each row"
 
     def at(self, station: str | int) -> Predictor:
         """The same model asked about one station alone, by name or number.

@@ -157,3 +157,27 @@ def by_left_out(
         gram = gram_of(torch.from_numpy(best), distance, columns)
         value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
     return float(value), Kernel.of(best, float(amplitude))
+
+
+def by_evidence(
+    start: Kernel, distance: Tensor, values: Tensor, bounds: Sequence[tuple[float, float]], looks: int,
+    tolerance: float,
+) -> Kernel:  # fmt: skip
+    """The kernel of largest evidence for values (n, P) of mean 0, its amplitude too, from `start` on.
+
+    Rasmussen and Williams 2006, eq. 5.8; distances (n, n) [m] of the places, bounds of `Kernel.parameters()`.
+    """
+
+    def whitened(at: Tensor) -> tuple[Tensor, Tensor]:
+        lower, failed = torch.linalg.cholesky_ex(gram_of(at, distance))
+        if failed:
+            raise NotPositiveDefiniteError("the covariance has no Cholesky factor")
+        return torch.linalg.solve_triangular(lower, values, upper=False).square().mean(), lower
+
+    def objective(at: Tensor) -> Tensor:
+        amplitude, lower = whitened(at)
+        return 0.5 * amplitude.clamp_min(TINY).log() + lower.diagonal().log().mean()
+
+    best, _ = walked(objective, [start.parameters()], bounds, looks, tolerance)
+    with torch.no_grad():
+        return Kernel.of(best, max(float(whitened(torch.from_numpy(best))[0]), TINY))

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.checks import outliers
+from gsparc.data.checks.coherence import coherence
 from gsparc.data.errors import some
 from gsparc.data.schema import ENDS, Measurements, Site
 from gsparc.data.splits import Split, SplitSettings, make_split, visits
@@ -41,6 +42,8 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         lines.append(("censored", f"{counts[0]} weak to be heard, {counts[1]} strong to be measured"))
     if data.run is not None:
         lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
+    if (phases := coherence(data)) is not None:
+        lines.append(("phases", str(phases)))
     if data.mask is not None and data.censored is None:
         lines.append(("mask", f"{data.mask.mean():.1%} of the entries were measured"))
     if data.directions is not None:

@@ -130,7 +130,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             several = data.site.stations is not None and folds.name != "stations"
             known = names_scene(data.provenance)
             problems.append(
-                Problem(name, split.name, data.site.kind, hashes, draw, several, known, chosen, data, folds)
+                Problem(name, split.name, data.site.scored, hashes, draw, several, known, chosen, data, folds)
             )
     return problems
 

@@ -160,7 +160,7 @@ class Study:
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
             by_condition[condition] = outcome
-            figure = DECIDING[data.site.kind]
+            figure = DECIDING[data.site.scored]
             log.info(
                 "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
                 variant, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
@@ -171,7 +171,7 @@ class Study:
     def _rows(
         self, outcomes: Mapping[tuple[str, Condition], list[Outcome]], data: Measurements, split: Split
     ) -> pd.DataFrame:
-        figure = DECIDING[data.site.kind]
+        figure = DECIDING[data.site.scored]
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         methods = {str(id(o[-1].methods[0])): o[-1].methods[0] for o in outcomes.values()}
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)

@@ -54,7 +54,7 @@ def sweep(
     Returns:
         A point per candidate and number of threads, and the times [ms] of `others`.
     """
-    figure, split = DECIDING[data.site.kind], Split("tradeoff", (fold,), "")
+    figure, split = DECIDING[data.site.scored], Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
     whole = None
     places = data.moving[rows_of(fold, eval_on)] + data.site.origin
@@ -186,7 +186,7 @@ def others_of(
     run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str
 ) -> dict[str, tuple[Method, float | None]]:
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
-    figure, data = DECIDING[run.data.site.kind], run.data
+    figure, data = DECIDING[run.data.site.scored], run.data
     whole = Split("tradeoff", (run.split.folds[0],), "")
     methods: dict[str, tuple[Method, float | None]] = {}
     for name in baselines:

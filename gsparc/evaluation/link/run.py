@@ -53,6 +53,7 @@ class LinkStudy:
         site, self.antenna, self.shape = run.data.site, int(settings["antenna"]), settings["pusch"]
         if site.kind != "csi" or site.subcarriers_hz is None:
             raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
+        site.need_phase("gsparc link")
         if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
             raise ValueError(f"antenna={self.antenna}: the target has {antennas}")
         self.receivers = list(self.shape["receivers"])

@@ -27,11 +27,12 @@ from gsparc.models.image_sources.run_factors import RunFactors, run_factors
 from gsparc.models.method import Method, Prediction
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import WaveKernel
+from gsparc.processes.kernel import Kernel, WaveKernel
 from gsparc.processes.nearest import Nearest, Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.prior import Prior
+from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -42,6 +43,7 @@ MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is
 NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
 TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
 ENTRIES = 64  # of their channels
+REFINED = 3  # walks to the two lengths
 NAMED = 6  # factors of runs that a note gives
 
 
@@ -64,11 +66,9 @@ class ComplexGP(Method):
         return approximated(self.name, self.posterior)
 
     @property
-    def kernel(self) -> WaveKernel:
+    def kernel(self) -> WaveKernel | Kernel:
         """Its length, noise and power."""
-        kernel = self._fitted().prior.kernel
-        assert isinstance(kernel, WaveKernel)
-        return kernel
+        return self._fitted().prior.kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -85,8 +85,15 @@ class ComplexGP(Method):
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
-    def _kernels(self) -> Iterator[WaveKernel]:
+    def _kernels(self, places: Tensor, values: Tensor) -> Iterator[WaveKernel | Kernel]:
+        """Candidates for values (n, R) at places (n, D) [m]; two lengths in a free gauge."""
         assert self.site is not None and self.site.wavelength is not None
+        if self.site.gauge == "free":
+            kernel, rows = first_kernel(self.site.wavelength), (places.numpy(), values.numpy())
+            for _ in range(REFINED):
+                kernel = two_lengths(*rows, self.site.wavelength, kernel)
+            yield replace(kernel, amplitude=1.0)
+            return
         for length in LENGTHS:
             for noise in NOISES:
                 yield WaveKernel(2 * math.pi / self.site.wavelength, length * self.site.wavelength, noise)
@@ -103,7 +110,7 @@ class ComplexGP(Method):
             some = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]))
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
         looked_at = places[some], target[some], run[some.numpy()]
-        kernel = min(self._kernels(), key=lambda one: _aligned(one, *looked_at)[0])
+        kernel = min(self._kernels(places[some], target[some]), key=lambda one: _aligned(one, *looked_at)[0])
         _, conditioned, aligning = _aligned(kernel, places, target, run)
         power = max(float((target * aligning[:, None]).abs().square().mean()), 1e-30)
         prior = Prior(replace(kernel, amplitude=power))
@@ -140,7 +147,8 @@ class ComplexGP(Method):
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
         sample = torch.from_numpy(values.places[rows]), means[rows][..., entries], counts[rows], scatter[row]
-        kernel = min(self._kernels(), key=lambda one: _density(one, *sample))
+        kernels = self._kernels(torch.from_numpy(values.places), means)
+        kernel = min(kernels, key=lambda one: _density(one, *sample))
         power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
         prior = Prior(replace(kernel, amplitude=power))
         self.posterior = given(prior, values, 0, most=NEAREST)
@@ -195,7 +203,7 @@ class ComplexGP(Method):
 
 
 def _aligned(
-    kernel: WaveKernel, places: Tensor, target: Tensor, run: np.ndarray
+    kernel: WaveKernel | Kernel, places: Tensor, target: Tensor, run: np.ndarray
 ) -> tuple[float, Conditioned, Tensor]:
     """Negative log likelihood of the best power and runs' factors, channels given these, what aligns rows.
 
@@ -215,7 +223,9 @@ def _aligned(
     return 0.5 * nll - float(aligning.abs().log().mean()), conditioned, aligning
 
 
-def _density(kernel: WaveKernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
+def _density(
+    kernel: WaveKernel | Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor
+) -> float:
     """Negative log density of rows given their neighbours at the best power, visits to one place included.
 
     Args:

@@ -1,0 +1,165 @@
+"""Whether channels of neighbouring rows share phase, delay and level, or each packet has its own."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.limits import SettingError
+from gsparc.data.moments import Snapshots
+from gsparc.data.schema import Measurements
+from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning, words
+
+log = logging.getLogger(__name__)
+
+NEAR, IN_LINE = 0.125, 0.5  # wavelengths between rows of nearly one channel, and of a steady phase advance
+MOST_ENTRIES = 4_000_000  # of channels from the first row on, which tell of all
+MOST = 400  # pairs or triples that are looked at
+FEWEST = 12
+AROUND = 6  # neighbours of a row that are looked at
+STRAIGHT, EVEN = -0.9, 0.7  # cosine at the middle row of three, and ratio of its distances
+OWN = {NEAR: 0.7, IN_LINE: 0.45}  # share of the correlation that rows with phases of their own keep at most
+ALIKE = {NEAR: (0.5, 0.8), IN_LINE: (0.6, 0.8)}  # correlation of neighbours of one shape, at least
+CHANCE = 2.0  # times the correlation of noise, within these limits
+MORE = 0.1  # of correlation that a free delay must bring
+SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
+
+
+@dataclass(frozen=True)
+class Coherence:
+    """What neighbouring rows have in common; correlations are 1 where nothing differs.
+
+    Attributes:
+        pairs: of neighbours that were compared.
+        distance: between them, the median [m].
+        as_measured: size of the mean correlation with phases as they are; where rows are further apart than
+            an eighth wavelength, of the advance of the phase between three rows in line.
+        phase, delay: mean correlation after a free phase, and after a delay too, of each pair.
+        level_db: scatter of levels between neighbours [dB].
+        freedom: what each row must be allowed.
+    """
+
+    pairs: int
+    distance: float
+    as_measured: float
+    phase: float
+    delay: float
+    level_db: float
+    freedom: Freedom
+
+    def __str__(self) -> str:
+        own = "" if self.freedom == "none" else f"every row has {words(self.freedom)} of its own: "
+        return (
+            f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
+            f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
+            f"scatter by {self.level_db:.1f} dB ({self.pairs} pairs)"
+        )
+
+
+def coherence(data: Measurements) -> Coherence | None:
+    """The verdict on channels; None where no rows are near enough to tell, or there is one entry a row.
+
+    Rows are compared within a run, and all antennas or stations of a moment as one. Nothing is drawn.
+    """
+    site = data.site
+    if site.kind != "csi" or site.wavelength is None or data.uplink is not None:
+        return None
+    few = max(MOST_ENTRIES // data.target[0].size, 1)
+    rows = Snapshots.of(data, np.arange(min(len(data), few)))
+    if rows.values[0].size < 2:
+        return None
+    power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
+    values, reach = rows.values / np.maximum(power, np.finfo(float).tiny), NEAR
+    near = _neighbours(rows, NEAR * site.wavelength, pairs=True)
+    if len(near) < FEWEST:
+        reach, near = IN_LINE, _neighbours(rows, IN_LINE * site.wavelength, pairs=False)
+    if len(near) < FEWEST:
+        return None
+    middle = values[near[:, 0]]
+    first, size = _correlation(middle, values[near[:, 1]])
+    measured = abs(first.mean())
+    if reach == IN_LINE:  # in the next step the phase advances as in this one
+        second, _ = _correlation(values[near[:, 2]], middle)
+        measured = np.sqrt(abs((first * second.conj()).mean()))
+    a, b = middle, values[near[:, 1]]
+    turned = a * turning(a, b, rows.tones, "phase+delay")[:, None]
+    phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
+    levels = 10 * np.log10(size[:, 0] / size[:, 1])
+    scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
+    freedom: Freedom = "none"
+    noise = np.sqrt(max(np.log(max(len(delays(rows.tones)), 3)), 1.0) / values[0].size)
+    if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
+        freedom = "phase+delay" if delay > phase + MORE else "phase"
+        freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom
+    apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
+    return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
+
+
+def allowed(data: Measurements, align: str) -> Measurements:
+    """The measurements with what of each row is free: as `align` says, `auto` by `coherence`.
+
+    Raises:
+        SettingError: no such freedom, or one of what are no channels.
+    """
+    if align not in ("auto", *FREEDOMS):
+        raise SettingError(f"dataset.align={align}: is none of auto, {', '.join(FREEDOMS)}")
+    if data.site.kind != "csi":
+        if align not in ("auto", "none"):
+            raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")
+        return data
+    freedom: Freedom = align  # type: ignore[assignment]
+    if align == "auto":
+        found = coherence(data)
+        if found is None or found.freedom == "none":
+            return data
+        freedom = found.freedom
+        log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
+        if (apart := _places_apart(data)) > IN_LINE:
+            log.warning(
+                "places are %.3g wavelengths apart: neighbours tell levels, not the shape over subcarriers",
+                apart,
+            )  # fmt: skip
+    return replace(data, site=replace(data.site, freedom=freedom))
+
+
+def _places_apart(data: Measurements) -> float:
+    """Median distance from a place to the next other one [wavelengths]."""
+    places = np.unique(data.moving, axis=0)
+    if len(places) < 2 or data.site.wavelength is None:
+        return 0.0
+    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) / data.site.wavelength
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of rows (P, A, K) each with each, (P,) complex, and what both measured (P, 2) of power."""
+    both = (a != 0) & (b != 0)
+    size = np.stack([(np.abs(one) ** 2 * both).sum((1, 2)) for one in (a, b)], 1).clip(1e-300)
+    return (a * b.conj()).sum((1, 2)) / np.sqrt(size.prod(1)), size
+
+
+def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
+    """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
+    found = [np.zeros((0, 2 if pairs else 3), np.int64)]
+    for run in np.unique(rows.run):
+        own = np.flatnonzero(rows.run == run)
+        at = rows.places[own]
+        near, index = (part.reshape(len(own), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(own))))
+        good = (near <= reach) & (index != np.arange(len(own))[:, None])
+        if pairs:
+            one, column = np.nonzero(good & (index > np.arange(len(own))[:, None]))
+            found.append(own[np.c_[one, index[one, column]]])
+            continue
+        good &= near > 0
+        step = (at[index] - at[:, None]) / np.maximum(near, 1e-12)[..., None]
+        first = good.argmax(1)
+        towards = np.take_along_axis(step, first[:, None, None], 1)
+        length = np.take_along_axis(near, first[:, None], 1)
+        opposite = good & ((step * towards).sum(-1) < STRAIGHT) & (length > EVEN * near)
+        middle = np.flatnonzero(good.any(1) & opposite.any(1))
+        third = opposite.argmax(1)
+        found.append(own[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
+    every = np.concatenate(found)
+    return every[np.unique(np.linspace(0, len(every) - 1, MOST).astype(int))] if len(every) else every

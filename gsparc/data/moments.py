@@ -1,0 +1,77 @@
+"""Rows of several stations that were measured at one moment, as one row of all stations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsparc.data.schema import Measurements
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """Channels of n moments at A antennas, of all stations, and K tones.
+
+    Attributes:
+        rows: (S,) of the measurements.
+        moment: (S,) int64, which moment a row is of.
+        antenna: (S,) int64, the first antenna of a row's station.
+        places: (n, D) [m] of what moves.
+        values: (n, A, K) complex128, 0 where nothing was measured.
+        tones: (K,) [Hz], relative to their mean.
+        run: (n,) int64.
+    """
+
+    rows: np.ndarray
+    moment: np.ndarray
+    antenna: np.ndarray
+    places: np.ndarray
+    values: np.ndarray
+    tones: np.ndarray
+    run: np.ndarray
+
+    @classmethod
+    def of(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
+        """Of rows (S,): the i-th visit of each station to a place is one moment."""
+        station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+        moment = np.arange(len(rows))
+        if data.station is not None and data.place is not None:
+            visit = _visits(data.place[rows], station)
+            _, moment = np.unique(np.c_[data.place[rows], visit], axis=0, return_inverse=True)
+            moment = moment.reshape(-1)
+        _, first = np.unique(moment, return_index=True)
+        target = np.asarray(data.target[rows])
+        if data.mask is not None:
+            target = np.where(data.mask[rows], target, 0)
+        names, column = np.unique(station, return_inverse=True)
+        tones = data.site.subcarriers_hz
+        known = tones is not None and len(tones) == target.shape[2]
+        tones = np.asarray(tones, float) if known else np.zeros(target.shape[2])
+        run = np.zeros(len(first), np.int64) if data.run is None else data.run[rows[first]]
+        empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
+        one = cls(
+            rows, moment, column * target.shape[1], data.moving[rows[first]], empty, tones - tones.mean(), run
+        )
+        return replace(one, values=one.arranged(target))
+
+    def arranged(self, rows: np.ndarray) -> np.ndarray:
+        """Values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""
+        values = np.zeros_like(self.values)
+        for offset in range(rows.shape[1]):
+            values[self.moment, self.antenna + offset] = rows[:, offset]
+        return values
+
+    def to_rows(self, factors: np.ndarray) -> np.ndarray:
+        """Factors (S, 1, K) of rows, by those (n, K) of moments."""
+        return factors[self.moment][:, None]
+
+
+def _visits(place: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """How often a row's station was at its place before, (S,)."""
+    key = np.unique(np.c_[place, station], axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(key, kind="stable")
+    start = np.r_[0, np.flatnonzero(np.diff(key[order])) + 1]
+    result = np.empty(len(key), np.int64)
+    result[order] = np.arange(len(key)) - np.repeat(start, np.diff(np.r_[start, len(key)]))
+    return result

@@ -1,0 +1,222 @@
+"""Channels whose rows have phases, delays and gains of their own, turned until they fit their neighbours.
+
+With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree of
+near places, then each to what a process of all other rows says of it, in turns with the process's settings.
+Many gauges fit: phases that vary slowly over places are as good as the carrier's ("free"), unless antennas at
+known places see the same factor, which leaves one gauge alone, that of waves ("carrier"); the one that
+predicts rows left out better, after the same freedom, is taken.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import weakref
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from gsparc.data.moments import Snapshots
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.physics.row_factors import Freedom, turning, words
+from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.nearest import weights_of
+from gsparc.processes.neighbourhood import covering
+from gsparc.processes.two_lengths import first_kernel, two_lengths
+
+log = logging.getLogger(__name__)
+
+NEIGHBOURS = 50  # rows that tell of a row
+TREE = 2_000  # rows of the spanning tree; others hang on the nearest of these
+ROUNDS, SWEEPS = 6, 10
+WAVE_SWEEPS = 40
+WAVE_NOISE = 0.1  # of the signal's power
+ANTENNAS = 4  # with one factor, from which on waves leave one gauge
+SHARED = 0.5  # of antennas heard at a moment, from which on stations have their factors in common
+SPACINGS = 4.0  # median distances to the next row that stand for a wavelength where none is known
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Factors that turn rows to each other.
+
+    Attributes:
+        factors: (n, K) complex128.
+        error: of rows predicted from the others after the same freedom, relative to their power.
+        gauge: `carrier`, phases over places are those of waves; `free`, neighbours were made alike.
+    """
+
+    factors: np.ndarray
+    error: float
+    gauge: Literal["carrier", "free"]
+
+
+def in_one_gauge(data: Measurements, fold: Fold) -> Measurements:
+    """The measurements with training and validation rows turned to each other; as they are where that is so.
+
+    Rows keep what `site.freedom` leaves them; test rows are not looked at.
+    """
+    site = data.site
+    if site.freedom == "none" or site.gauge is not None:
+        return data
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    key = (known.tobytes(), site.sha256)
+    for reference, its, result in _LAST:
+        if reference() is data and its == key:
+            return result
+    target, found = np.array(data.target), []
+    for rows in _parts(data, known):
+        best, own = align(rows, site.freedom, site), target[rows.rows]
+        found.append(best)
+        factors = rows.to_rows(best.factors)
+        if site.freedom == "phase+delay+gain":
+            factors = factors / np.maximum(_rms(rows.values), 1e-30)[rows.moment][:, None, None]
+        target[rows.rows] = (own * factors).astype(target.dtype)
+    gauge: Literal["carrier", "free"] = "carrier" if all(one.gauge == "carrier" for one in found) else "free"
+    log.info(
+        "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
+        len(known), words(site.freedom), float(np.mean([one.error for one in found])),
+        "the carrier's" if gauge == "carrier" else "free",
+    )  # fmt: skip
+    result = replace(data, target=target, run=None, site=replace(site, gauge=gauge))
+    _LAST[:] = [(weakref.ref(data), key, result)]
+    return result
+
+
+def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
+    """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
+    whole = Snapshots.of(data, known)
+    if data.station is None or (whole.values != 0).mean() >= SHARED:
+        return [whole]
+    return [Snapshots.of(data, known[data.station[known] == one]) for one in np.unique(data.station[known])]
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Of what was measured in rows (n, A, K), (n,)."""
+    count = np.maximum((values != 0).sum((1, 2)), 1)
+    return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
+
+
+_LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, str], Measurements]] = []  # baselines share it
+
+
+def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
+    """The best of a free gauge and, where several antennas tell, the carrier's."""
+    power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
+    values = rows.values / np.maximum(power, np.finfo(float).tiny)
+    if freedom == "phase+delay+gain":
+        values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
+    length = site.wavelength or SPACINGS * _spacing(rows.places)
+    one = _Rows(rows.places, values, rows.tones, freedom, length)
+    found = [one.smooth(one.along_tree(None))]
+    direct = _direct(rows, site)
+    if direct is not None:
+        found.append(one.waves(one.along_tree(direct)))
+    return min(found, key=lambda each: each.error)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of unit power at every antenna, and what of them is free."""
+
+    places: np.ndarray
+    values: np.ndarray
+    tones: np.ndarray
+    freedom: Freedom
+    length: float
+
+    def along_tree(self, direct: np.ndarray | None) -> np.ndarray:
+        """Factors (n, K) that turn each row to the next of a tree of near places, about a direct wave."""
+        values = self.values if direct is None else self.values * direct.conj()
+        factors = np.ones((len(values), len(self.tones)), np.complex128)
+        trunk = covering(self.places, TREE, 0)
+        tree = minimum_spanning_tree(cdist(self.places[trunk], self.places[trunk]) + 1e-12)
+        order, before = breadth_first_order(tree, 0, directed=False)
+        child, parent = trunk[order[1:]], trunk[before[order[1:]]]
+        rest = np.setdiff1d(np.arange(len(values)), trunk)
+        if len(rest):
+            next_to = cKDTree(self.places[trunk]).query(self.places[rest])[1]
+            child, parent = np.r_[child, rest], np.r_[parent, trunk[next_to]]
+        steps = turning(values[child], values[parent], self.tones, self.freedom_of_phase)
+        for row, onto, step in zip(child, parent, steps, strict=True):
+            factors[row] = step * factors[onto]
+        return factors
+
+    @property
+    def freedom_of_phase(self) -> Freedom:
+        """Without the gain, which unit rows have lost."""
+        return "phase" if self.freedom == "phase" else "phase+delay"
+
+    def smooth(self, factors: np.ndarray) -> Alignment:
+        """From these factors on, by a process of two lengths; of its rounds the one that tells rows best."""
+        kernel, found = first_kernel(self.length), []
+        for _ in range(ROUNDS):
+            factors = self._swept(factors, self._weights(kernel), SWEEPS)
+            found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "free"))
+            turned = (self.values * factors[:, None]).reshape(len(factors), -1)
+            kernel = two_lengths(self.places, turned, self.length, kernel)
+        return min(found, key=lambda each: each.error)
+
+    def waves(self, factors: np.ndarray) -> Alignment:
+        """From these factors on, by waves from everywhere alike."""
+        weights = self._weights(WaveKernel(2 * math.pi / self.length, 1e3 * self.length, WAVE_NOISE))
+        factors = self._swept(factors, weights, WAVE_SWEEPS)
+        return Alignment(factors, self._error(factors, weights), "carrier")
+
+    def _weights(self, kernel: Kernel | WaveKernel) -> tuple[np.ndarray, np.ndarray]:
+        """Neighbours (n, k) of each row and their weights in what the others say of it."""
+        index = cKDTree(self.places).query(self.places, k=min(NEIGHBOURS + 1, len(self.places)))[1]
+        mine = index == np.arange(len(index))[:, None]
+        mine[~mine.any(1), -1] = True  # of many rows at one place, itself is not among the nearest
+        near = index[~mine].reshape(len(index), -1)
+        at, around = torch.from_numpy(self.places), torch.from_numpy(self.places[near])
+        noise = torch.full(near.shape, float(kernel.noise), dtype=torch.float64)
+        return near, weights_of(kernel, at, around, noise)[0].numpy()
+
+    def _told(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Rows (n, A, K) as the others say."""
+        near, weight = weights
+        turned = self.values * factors[:, None]
+        return np.einsum("nk,nkat->nat", weight, turned[near])
+
+    def _swept(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray], sweeps: int) -> np.ndarray:
+        for _ in range(sweeps):
+            told = self._told(factors, weights)
+            factors = turning(self.values, told, self.tones, self.freedom_of_phase)
+        return factors
+
+    def _error(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray]) -> float:
+        told = self._told(factors, weights)
+        told = told * turning(told, self.values, self.tones, self.freedom)[:, None]
+        missed = np.abs(self.values - told) ** 2 * (self.values != 0)
+        return float(missed.sum() / (np.abs(self.values) ** 2).sum())
+
+
+def _spacing(places: np.ndarray) -> float:
+    near = cKDTree(places).query(places, k=min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
+    return max(float(np.median(near)), 1e-9)
+
+
+def _direct(rows: Snapshots, site: Site) -> np.ndarray | None:
+    """The direct wave (n, A, 1) where enough antennas at known places see one factor; None elsewhere."""
+    if site.wavelength is None or rows.values.shape[1] < ANTENNAS or rows.places.shape[1] != 3:
+        return None
+    if site.stations is not None:
+        names = np.unique(rows.antenna)
+        count = rows.values.shape[1] // max(len(names), 1)
+        ends = np.repeat(site.stations.position[: len(names)], count, axis=0)
+    elif site.array is not None and site.static_position is not None and site.static_end == "rx":
+        turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+        ends = site.static_position + site.array @ turned.T
+    else:
+        return None
+    if len(ends) != rows.values.shape[1] or not np.isfinite(ends).all():
+        return None
+    distance = np.linalg.norm(rows.places[:, None] - ends[None], axis=2)
+    return np.exp(-2j * np.pi / site.wavelength * distance)[..., None]

@@ -1,0 +1,66 @@
+"""What a receiver multiplies all of one packet by: a phase, a delay, a gain that nobody knows.
+
+Wi-Fi cards start a packet at a sample of their own (a delay, a slope of the phase over subcarriers), with an
+oscillator of their own (a phase) and a gain of their own (S. Sen et al., "You are facing the Mona Lisa: spot
+localization using PHY layer information", MobiSys 2012; M. Kotaru et al., "SpotFi", SIGCOMM 2015).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+Freedom = Literal["none", "phase", "phase+delay", "phase+delay+gain"]
+FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
+FINE = 8  # delays tried within one over the bandwidth
+MOST_DELAYS = 1024
+
+
+def words(freedom: Freedom) -> str:
+    """For messages: `a phase and a delay`."""
+    parts = [f"a {part}" for part in freedom.split("+")]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+
+
+def delays(tones: np.ndarray) -> np.ndarray:
+    """Delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0."""
+    tones = np.sort(tones)
+    width, gaps = tones[-1] - tones[0], np.diff(tones)
+    if width <= 0:
+        return np.zeros(1)
+    step = 1 / (FINE * width)
+    half = min(int(0.5 / (gaps[gaps > 0].min() * step)), MOST_DELAYS // 2)
+    return step * np.arange(-half, half + 1)
+
+
+def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom) -> np.ndarray:
+    """Factors (n, K) that turn rows to their references best; 1 where nothing is free.
+
+    The delay is the largest of the correlation over tones, between samples by a parabola.
+
+    Args:
+        values: (n, A, K) complex, 0 where nothing was measured.
+        reference: (n, A, K) complex.
+        tones: (K,) [Hz].
+        freedom: what of a row is free.
+    """
+    if freedom == "none":
+        return np.ones((len(values), len(tones)), np.complex128)
+    product = (values * reference.conj()).sum(1)
+    slope = np.zeros(len(values))
+    tried = delays(tones) if freedom != "phase" else np.zeros(1)
+    if len(tried) > 2:
+        steering = np.exp(2j * np.pi * tried[:, None] * (tones - tones.mean()))
+        size = np.abs(product @ steering.T)
+        rows, best = np.arange(len(size)), size.argmax(1).clip(1, len(tried) - 2)
+        before, peak, after = (size[rows, best + by] for by in (-1, 0, 1))
+        curvature = np.minimum(before - 2 * peak + after, -np.finfo(float).tiny)
+        slope = tried[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (tried[1] - tried[0])
+    turned = np.exp(2j * np.pi * slope[:, None] * (tones - tones.mean()))
+    overlap = (product * turned).sum(1)
+    factor = turned * np.exp(-1j * np.angle(overlap))[:, None]
+    if freedom == "phase+delay+gain":
+        own = (np.abs(values) ** 2).sum((1, 2))
+        factor *= np.divide(np.abs(overlap), own, out=np.ones_like(own), where=own > 0)[:, None]
+    return factor

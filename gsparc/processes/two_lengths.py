@@ -1,0 +1,47 @@
+"""A process of complex values with a short and a long length, chosen by evidence in units of a wavelength.
+
+Of channels whose rows were turned to be like their neighbours, the carrier's phase is gone: what is left
+varies within a fraction of a wavelength where paths interfere, and over many as the strongest does.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from gsparc.processes.density import by_evidence
+from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.neighbourhood import covering
+
+SHORT, LONG = (0.25, 1.0), (1.0, 300.0)  # wavelengths; next to no field varies within a quarter
+START = (0.37, 2.8)
+NOISES = (1e-4, 10.0)  # of the signal's power
+LOGIT = 6.0  # of the shares
+LEARNED_ON = 400  # rows
+LOOKS, SETTLED = 8, 1e-4
+
+
+def first_kernel(length: float) -> Kernel:
+    """Before anything was learned; `length` is a wavelength, or what stands for it [m]."""
+    return Kernel((START[0] * length, START[1] * length), (0.5, 0.5), 0.01)
+
+
+def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
+    """The kernel of largest evidence near `start`.
+
+    Args:
+        places: (n, D) [m].
+        values: (n, P) complex.
+        length: see `first_kernel`.
+        start: where to begin.
+    """
+    rows = covering(places, LEARNED_ON, 0)
+    at = torch.from_numpy(places[rows])
+    real = torch.from_numpy(np.concatenate([values[rows].real, values[rows].imag], 1)).double()
+    bounds = [
+        *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
+        (-LOGIT, LOGIT), (math.log(NOISES[0]), math.log(NOISES[1])),
+    ]  # fmt: skip
+    return by_evidence(start, apart(at, at), real, bounds, LOOKS, SETTLED)

@@ -1,0 +1,42 @@
+"""Factors of packets: a phase, a delay and a gain are found again from any reference."""
+
+import numpy as np
+import pytest
+
+from gsparc.physics.row_factors import delays, turning
+
+TONES = 312.5e3 * np.r_[-26:0, 1:27]
+
+
+def rows(seed=0, count=20, antennas=3):
+    draw = np.random.default_rng(seed)
+    shape = (count, antennas, len(TONES))
+    return draw.standard_normal(shape) + 1j * draw.standard_normal(shape)
+
+
+@pytest.mark.parametrize("freedom", ["phase", "phase+delay", "phase+delay+gain"])
+def test_what_was_put_on_rows_is_taken_off(freedom):
+    true, draw = rows(), np.random.default_rng(1)
+    phase, delay, gain = draw.uniform(0, 6.28, 20), draw.uniform(-2e-7, 2e-7, 20), draw.uniform(0.5, 2, 20)
+    put_on = np.exp(1j * phase)[:, None] * np.ones(len(TONES))
+    if "delay" in freedom:
+        put_on = put_on * np.exp(-2j * np.pi * delay[:, None] * TONES)
+    if "gain" in freedom:
+        put_on = put_on * gain[:, None]
+    logged = true * put_on[:, None]
+    found = turning(logged, true, TONES, freedom)
+    missed = np.abs(logged * found[:, None] - true) ** 2
+    assert missed.sum() < 1e-3 * (np.abs(true) ** 2).sum()
+
+
+def test_nothing_free_turns_nothing_and_silent_rows_stay():
+    true = rows()
+    assert (turning(true, true, TONES, "none") == 1).all()
+    assert np.isfinite(turning(0 * true, true, TONES, "phase+delay+gain")).all()
+    assert np.isfinite(turning(true, 0 * true, TONES, "phase+delay+gain")).all()
+
+
+def test_delays_cover_what_tones_tell_apart_and_no_more():
+    tried = delays(TONES)
+    assert tried[0] == pytest.approx(-0.5 / 312.5e3, rel=0.02) and tried[-1] == -tried[0]
+    assert len(delays(np.zeros(1))) == 1  # one tone tells no delay
