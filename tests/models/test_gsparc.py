@@ -29,6 +29,7 @@ from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.registry import build, method_class
+from gsparc.models.splat.averaged import ImageProcess
 from gsparc.ops import Pose
 from gsparc.training import race
 from gsparc.training.context import FitReport
@@ -162,7 +163,7 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     before = fitted.lines[: fitted.lines.index(first)]
     assert all(line.startswith(("effects.", "the residual is all there is")) for line in before)
     init = "+".join(part for part in first.partition("init=")[2].split(",")[:1])
-    assert ("by rendering" in first) == (fitted.method.field is None) and init
+    assert ("by rendering" in first) == isinstance(fitted.method.chosen, ImageProcess) and init
     assert ("callbacks" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
@@ -242,7 +243,7 @@ def test_without_the_residual_gaussians_are_alone(name):
     fitted = fit(name, "model.effects.residual=false")
     method = fitted.method
     assert "residual" not in method.effects and method.size() > 0
-    if method.field is None:
+    if isinstance(method.chosen, ImageProcess):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
