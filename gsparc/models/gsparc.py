@@ -33,11 +33,13 @@ class Choice:
     """The method for a site.
 
     Attributes:
+        name: of the method, by which `model=NAME` has it directly.
         method: unfitted.
         reasons: one line each.
         options: that decided, by their paths; others may be heeded by the method.
     """
 
+    name: str
     method: Method
     reasons: tuple[str, ...]
     options: tuple[str, ...]
@@ -76,17 +78,18 @@ def choose(data: Measurements, settings: Gsparc) -> Choice:
         raise ValueError(
             "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
         )
-    if found is None:  # array_process or image_process
+    if found is None:
         settings.rendered.through_array(terms.array)
         settings.rendered.plain = plain
         options += ["init.name"] * (init.name in ("auto", "diffuse"))
-        return Choice(settings.rendered, tuple(reasons), tuple(options))
+        name = "array_process" if terms.array else "image_process"
+        return Choice(name, settings.rendered, tuple(reasons), tuple(options))
     if found is Channels and site.gauge != "free":
         why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
         reasons.append(f"the residual is all there is: {why}")
     solved = found(switches, settings.position_std, init)
     solved.sourceless = not count
-    return Choice(solved, tuple(reasons), tuple(options))
+    return Choice(found.name, solved, tuple(reasons), tuple(options))
 
 
 def _its(name: str) -> Any:
@@ -100,6 +103,7 @@ class Gsparc(LearnsTogether):
     Args:
         effects: switches of terms.
         position_std: of each coordinate of training positions [m]; None: as the data say.
+        name: as it appears in tables.
         **field: see `LearnedField`.
     """
 
@@ -111,12 +115,13 @@ class Gsparc(LearnsTogether):
     }  # fmt: skip
 
     def __init__(
-        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None, **field: Any
-    ) -> None:
+        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
+        name: str = "gsparc", **field: Any,
+    ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
-        self.rendered = ImageProcess(**{"name": "gsparc", **field})
+        self.rendered = ImageProcess(name=name, **field)
         self.rendered.chosen_by = type(self)
-        self.name, self.guesses, self.init = self.rendered.name, self.rendered.guesses, self.rendered.init
+        self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std = effects, position_std
         self.chosen: Method = self.rendered
 
@@ -128,6 +133,7 @@ class Gsparc(LearnsTogether):
         heeded.count(*choice.options)
         for reason in choice.reasons:
             log.info("%s", reason)
+        log.info("%s is model=%s here", self.name, choice.name)
         self.site, self.chosen = data.site, choice.method
         self.chosen.name = self.name
         if self.chosen is self.rendered and std is not None and std[[*fold.train, *fold.val]].any():
@@ -156,6 +162,9 @@ class Gsparc(LearnsTogether):
     gradient_problem = _its("gradient_problem")
     field_alone = _its("field_alone")
     field = _its("field")
+    fitted = _its("fitted")
+    steps = _its("steps")
+    steps_taken = _its("steps_taken")
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""

@@ -53,10 +53,12 @@ DECLARED = {
     "splat": "Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
-    "gsparc": "HasPaths Reducible",
+    **dict.fromkeys(("array_process", "image_process"), "Reducible"),
+    **dict.fromkeys(("gsparc", "image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
 }
+NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
-GRADIENTS += ("moving_array", "splat", "gsparc")  # see tests/prediction/test_gradients.py
+GRADIENTS += ("moving_array", "splat", "gsparc", *NAMED)  # see tests/prediction/test_gradients.py
 VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
@@ -147,7 +149,7 @@ def test_a_method_is_what_the_table_says(name):
     method = method_class(name)()
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in ("image_source_gp", "splat", "gsparc"))
+    assert method.resumable == (name in ("image_source_gp", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
