@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_inside
-from gsparc.data.limits import check_arguments, number, or_null
+from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -35,7 +35,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, contributions, knobs, reduced
-from gsparc.models.refined_places import displaced, refined
+from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, no_array, no_phase
@@ -57,6 +57,7 @@ class ClosedForms(LearnsTogether):
         effects: switches of terms, of which `visibility` and `residual` are heeded.
         position_std: of each coordinate of training positions [m]; None: as the data say.
         init: where sources come from, and how many searches find them.
+        residual_alone: whether no sources are asked for.
     """
 
     has_gaussians = True
@@ -65,11 +66,11 @@ class ClosedForms(LearnsTogether):
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        init: InitSettings | None = None,
+        init: InitSettings | None = None, residual_alone: bool = False,
     ) -> None:  # fmt: skip
-        check_arguments(locals(), position_std=or_null(number(0)))
+        check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
         self.switches, self.position_std, self.init = effects, position_std, init or InitSettings()
-        self.sourceless = False  # whether the residual is all that is asked for
+        self.residual_alone = residual_alone
         self.explained: float | None = None
         self.init_s: float | None = None
         self.started = ""  # initialisers of what was fitted
@@ -109,21 +110,18 @@ class ClosedForms(LearnsTogether):
         """
         self.site, self.runs = data.site, RunFactors.none()
         with heeded.apart():
-            obstacle, parts = self.obstacle(data), self.parts(data)
-            if obstacle is not None:
-                raise ValueError(f"{self.name}: {obstacle}")
+            if (why := self.obstacle(data)) is not None:
+                raise ValueError(f"{self.name}: {why}")
+            parts = self.parts(data)
             named = self.init.name in ("auto", "diffuse", *parts)
-            name = "diffuse" if self.sourceless else self.init.name if named else "auto"
+            name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
             init = replace(self.init, name=name)
-            std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
         heeded.count(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
-        if std is not None and std[np.concatenate([fold.train, fold.val])].any():
-            if data.site.kind != "spectrum" and data.site.static_end is not None:
-                heeded.count("model.position_std")
-                return self._fit_refined(parts, init, data, fold, context, std)
-            log.warning("position_std is not used: it is for channels and powers of one end that moves")
+        heeds = data.site.kind != "spectrum" and data.site.static_end is not None
+        if (std := errors_of(data, fold, self.position_std, heeds)) is not None:
+            return self._fit_refined(parts, init, data, fold, context, std)
         return self._solve(parts, init, data, fold, context)
 
     def _fit_refined(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +16,7 @@ from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.models.closed_forms import Bearings, Channels, ClosedForms, ImageSources, Powers
 from gsparc.models.method import HasPaths, HasProcess, Method, Reconditions
+from gsparc.models.refined_places import errors_of
 from gsparc.models.splat.averaged import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.stations import LearnsTogether
@@ -28,68 +28,52 @@ from gsparc.training.module import GaussianModule
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """The method for a site.
-
-    Attributes:
-        name: of the method, by which `model=NAME` has it directly.
-        method: unfitted.
-        reasons: one line each.
-        options: that decided, by their paths; others may be heeded by the method.
-    """
-
-    name: str
-    method: Method
-    reasons: tuple[str, ...]
-    options: tuple[str, ...]
-
-
-def choose(data: Measurements, settings: Gsparc) -> Choice:
-    """Return the method of the first row of the table that the measurements call for.
+def choose(data: Measurements, settings: Gsparc) -> Method:
+    """Return the method of the first row of the table that the measurements call for, and log why.
 
     Args:
         data: measurements; targets are not looked at.
         settings: as configured.
 
+    Returns:
+        Unfitted, under the name by which `model=NAME` has it directly.
+
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
-    count, falls = model.field.count, model.attenuation.inverse_distance
-    terms = called_for(switches, init, data, model.emission.hidden, count, falls)
-    plain = switches.residual is not False
-    placed = count > 0 or not plain
-    residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
-    table: tuple[tuple[bool, type[ClosedForms]], ...] = (
-        (site.gauge == "free", Channels),
-        (terms.power, Powers),
-        (terms.moving_array and placed, Bearings),
-        (terms.phase and placed, ImageSources),
-        (residual_alone, Channels),
-    )
-    found = next((kind for called, kind in table if called), None)
-    reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-    if found is None and switches.visibility is False:
-        raise ValueError(
-            "model.effects.visibility=false is not possible: rasterized Gaussians always occlude each other"
+    with heeded.apart():  # what decides is counted below; the method may heed more
+        switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
+        count, falls = model.field.count, model.attenuation.inverse_distance
+        terms = called_for(switches, init, data, model.emission.hidden, count, falls)
+        plain, hides = switches.residual is not False, switches.visibility
+        placed = count > 0 or not plain
+        residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
+        table: tuple[tuple[bool, type[ClosedForms] | None], ...] = (
+            (site.gauge == "free", Channels),
+            (terms.power, Powers),
+            (terms.moving_array and placed, Bearings),
+            (terms.phase and placed, ImageSources),
+            (residual_alone, Channels),
+            (True, None),  # Gaussians are rendered, through an array where there is one
         )
-    if found is Bearings and switches.visibility is True:
-        raise ValueError(
-            "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
-        )
-    if found is None:
-        settings.rendered.through_array(terms.array)
-        settings.rendered.plain = plain
-        options += ["init.name"] * (init.name in ("auto", "diffuse"))
-        name = "array_process" if terms.array else "image_process"
-        return Choice(name, settings.rendered, tuple(reasons), tuple(options))
-    if found is Channels and site.gauge != "free":
-        why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
-        reasons.append(f"the residual is all there is: {why}")
-    solved = found(switches, settings.position_std, init)
-    solved.sourceless = not count
-    return Choice(found.name, solved, tuple(reasons), tuple(options))
+        kind = next(kind for called, kind in table if called)
+        if kind in (None, Bearings) and hides is (kind is Bearings):
+            why = "rasterized Gaussians always occlude each other"
+            why = "spectra of a moving array hide nothing" if hides else why
+            raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
+        reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
+        if kind is Channels and site.gauge != "free":
+            why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
+            reasons.append(f"the residual is all there is: {why}")
+        if kind is None:
+            method: Method = settings.rendered.called_for(terms.array, plain)
+            options += ["init.name"] * (init.name in ("auto", "diffuse"))
+        else:
+            method = kind(switches, settings.position_std, init, residual_alone=not count)
+    heeded.count(*options)
+    for reason in reasons:
+        log.info("%s", reason)
+    return method
 
 
 def _its(name: str) -> Any:
@@ -127,17 +111,11 @@ class Gsparc(LearnsTogether):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the method, and fit it."""
-        with heeded.apart():
-            choice = choose(data, self)
-            std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
-        heeded.count(*choice.options)
-        for reason in choice.reasons:
-            log.info("%s", reason)
-        log.info("%s is model=%s here", self.name, choice.name)
-        self.site, self.chosen = data.site, choice.method
+        self.site, self.chosen = data.site, choose(data, self)
+        log.info("%s is model=%s here", self.name, self.chosen.name)
         self.chosen.name = self.name
-        if self.chosen is self.rendered and std is not None and std[[*fold.train, *fold.val]].any():
-            log.warning("position_std is not used: it is for channels and powers of one end that moves")
+        if self.chosen is self.rendered:
+            errors_of(data, fold, self.position_std, heeds=False)
         return self.chosen.fit(data, fold, context)
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:

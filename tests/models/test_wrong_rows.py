@@ -120,7 +120,9 @@ def with_directions(path):
 
 
 SLOW = {  # of data: what makes them, their kind, the methods that train or search there
-    "spectra": (spectra, "spectrum", ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc")),
+    "spectra": (
+        spectra, "spectrum", ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc"),
+    ),
     "spectra of a known array": (of_an_array("tx"), "spectrum", ("array", "array_process", "ngrf", "gsparc")),
     "spectra of a moving array": (
         of_an_array("rx"), "spectrum", ("moving_array", "bearings", "gsparc"),

@@ -60,10 +60,11 @@ class ImageProcess(LearnedField):
         base = "array" if self.settings.response.array else "image"
         return base + ("+residual" if self._average is not None else "")
 
-    def through_array(self, array: bool) -> None:
-        """Let Gaussians emit fields that the static receiver's array images, or images."""
-        response = replace(self.settings.response, array=array)
-        self.settings = replace(self.settings, response=response)
+    def called_for(self, array: bool, plain: bool) -> ImageProcess:
+        """Let Gaussians emit fields that the static receiver's array images, or images; return the method."""
+        self.settings = replace(self.settings, response=replace(self.settings.response, array=array))
+        self.plain, self.name = plain, "array_process" if array else "image_process"
+        return self
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -179,7 +180,8 @@ class ImageProcess(LearnedField):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self._average, self._average_mean = None, None
-        self.through_array(bool(state["array"]))
+        response = replace(self.settings.response, array=bool(state["array"]))
+        self.settings = replace(self.settings, response=response)
         super().restore(site, state["inner"])
         if state["beside"] is not None:
             method = GaussianProcess()
@@ -198,4 +200,4 @@ class ArrayProcess(ImageProcess):
 
     def __init__(self, name: str = "array_process", **field: Any) -> None:
         super().__init__(name=name, **field)
-        self.through_array(True)
+        self.settings = replace(self.settings, response=replace(self.settings.response, array=True))
