@@ -219,10 +219,8 @@ class ClosedForms(LearnsTogether):
 
         What other solutions and the residual add to channels is in no path.
         """
-        parts: list[tuple[float, Any]] = [(1.0, self.field)]
-        if isinstance(self.field, Mixture):
-            parts = list(self.field.parts())
-        made = [(w, one.method) for w, one in parts if isinstance(getattr(one, "method", None), HasPaths)]
+        methods = [(weight, getattr(one, "method", None)) for weight, one in self.field.parts()]
+        made = [(weight, method) for weight, method in methods if isinstance(method, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
         result = [(weight, method.paths(query)) for weight, method in made]
@@ -232,7 +230,7 @@ class ClosedForms(LearnsTogether):
 
     def _method(self) -> Method | None:
         """The method inside the only solution, where there is one."""
-        parts = [*self.field.parts()] if isinstance(self.field, Mixture) else [(1.0, self.field)]
+        parts = [*self.field.parts()]
         return getattr(parts[0][1], "method", None) if len(parts) == 1 else None
 
     # -- reductions --------------------------------------------------------------------------------

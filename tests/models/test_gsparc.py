@@ -151,7 +151,7 @@ def test_what_is_chosen_answers_the_same_by_its_own_name(name, named):
     same(both[0].method, both[1].method, asked(both[0]))
 
 
-@pytest.mark.parametrize("named", ["image_sources", "channels", "bearings"])
+@pytest.mark.parametrize("named", ["image_sources", "channels", "bearings", "array_process"])
 def test_a_method_of_another_kind_of_measurement_is_refused(named):
     with pytest.raises(ValueError, match=f"{named}: the target is rssi"):
         fit("powers", f"model={named}", small=())

@@ -22,6 +22,7 @@ from gsparc.models.pareto import Settings
 from gsparc.models.reduced import averaged, mean_alone
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.method import LearnedField
+from gsparc.models.terms import no_array
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.module import GaussianModule
@@ -72,6 +73,9 @@ class ImageProcess(LearnedField):
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
         self._average, self._average_mean = None, None
         with heeded.apart():
+            why = no_array(data.site, "rx", "the receiver moves") if self.settings.response.array else None
+            if why is not None:
+                raise ValueError(f"{self.name}: {why}")
             if not self.settings.field.count:
                 self.most_steps = 0
             choices, _ = resolve(self.settings, self.init.name, data.site)

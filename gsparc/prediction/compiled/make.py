@@ -175,7 +175,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
     field = getattr(method, "field", None)
-    parts = sorted(field.parts(), key=lambda one: -one[0]) if isinstance(field, Mixture) else [(1.0, field)]
+    parts = [] if field is None else sorted(field.parts(), key=lambda one: -one[0])
     for one in [method, *(getattr(part, "method", None) for _, part in parts)]:
         if isinstance(one, ImageSourceGP):
             return one
