@@ -63,6 +63,7 @@ class ClosedForms(LearnsTogether):
     has_gaussians = True
     resumable = True
     stored_names: ClassVar[dict[str, str]] = {"position_std": ""}
+    field: ConditionalField  # after `fit` or `restore`
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
@@ -193,6 +194,8 @@ class ClosedForms(LearnsTogether):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
+        if not hasattr(self, "field"):
+            raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         told = Prediction.joined([self.field(part) for part in query.split(QUERY_CHUNK)])
         return self.runs.restored(told, query.run)
 
