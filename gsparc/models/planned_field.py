@@ -28,7 +28,6 @@ from gsparc.models import stations
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import restored, stored
-from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture.closed_forms import solve, with_cost
@@ -36,6 +35,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, averaged, contributions, knobs, mean_alone, reduced
 from gsparc.models.refined_places import displaced, refined
+from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
 from gsparc.models.terms import EffectSettings, Plan

@@ -15,9 +15,9 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
-from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture.weights import comparable, explained
+from gsparc.models.run_factors import RunFactors
 from gsparc.models.terms import EffectSettings
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost

@@ -69,5 +69,5 @@ def test_the_setting_wins_over_the_verdict(caplog):
         assert allowed(own, "auto").site.freedom == "phase"
     assert "every row has a phase of its own" in caplog.text and "dataset.align=none" in caplog.text
     assert allowed(own, "none").site.freedom == "none"
-    with pytest.raises(SettingError, match="dataset.align=level"):
+    with pytest.raises(SettingError, match=r"dataset\.align=level"):
         allowed(data, "level")
