@@ -28,7 +28,6 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS, restored, stored
-from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import HasPaths, Method, Prediction
 from gsparc.models.mixture import solutions
 from gsparc.models.mixture.mixture import Mixture
@@ -36,6 +35,7 @@ from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Blended, contributions, knobs, reduced
 from gsparc.models.refined_places import displaced, errors_of, refined
+from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, no_array, no_phase

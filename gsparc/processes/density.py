@@ -90,6 +90,27 @@ class Evidence(torch.autograd.Function):
         return -slopes[0] * slope, slopes[0] * weights, None
 
 
+class Profiled(torch.autograd.Function):
+    """Negative evidence of values of mean 0 at the amplitude that fits them best, and that amplitude."""
+
+    @staticmethod
+    def forward(ctx: Any, gram: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Of values (n, P) with a covariance (n, n) relative to the amplitude [nats per number]."""
+        factor = Factor.of(gram.detach(), "raise")
+        weights, (count, outputs) = factor.solved(values), values.shape
+        amplitude = (values * weights).mean().clamp_min(TINY)
+        ctx.save_for_backward(
+            (outputs * factor.inverse - weights @ weights.T / amplitude) / (2 * count * outputs)
+        )
+        ctx.mark_non_differentiable(amplitude)
+        return 0.5 * (amplitude.log() + factor.log_determinant / count), amplitude
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        """By the covariance."""
+        return slopes[0] * ctx.saved_tensors[0], None
+
+
 def gram_of(parameters: Tensor, distance: Tensor, columns: Tensor | None = None) -> Tensor:
     """Covariance (n, n) with noise, relative to the amplitude, differentiable in `Kernel.parameters()`.
 
@@ -168,16 +189,10 @@ def by_evidence(
     Rasmussen and Williams 2006, eq. 5.8; distances (n, n) [m] of the places, bounds of `Kernel.parameters()`.
     """
 
-    def whitened(at: Tensor) -> tuple[Tensor, Tensor]:
-        lower, failed = torch.linalg.cholesky_ex(gram_of(at, distance))
-        if failed:
-            raise NotPositiveDefiniteError("the covariance has no Cholesky factor")
-        return torch.linalg.solve_triangular(lower, values, upper=False).square().mean(), lower
-
     def objective(at: Tensor) -> Tensor:
-        amplitude, lower = whitened(at)
-        return 0.5 * amplitude.clamp_min(TINY).log() + lower.diagonal().log().mean()
+        return Profiled.apply(gram_of(at, distance), values)[0]  # type: ignore[no-untyped-call]
 
     best, _ = walked(objective, [start.parameters()], bounds, looks, tolerance)
     with torch.no_grad():
-        return Kernel.of(best, max(float(whitened(torch.from_numpy(best))[0]), TINY))
+        gram = gram_of(torch.from_numpy(best), distance)
+        return Kernel.of(best, float(Profiled.apply(gram, values)[1]))  # type: ignore[no-untyped-call]

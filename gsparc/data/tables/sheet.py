@@ -347,7 +347,8 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
     for delimiter in DELIMITERS:
         cells = [_cells(lines[n], delimiter) for n in numbers]
         usual = Counter(map(len, cells)).most_common(1)[0][0]
-        roles = [sum(understand(cell).role is not None for cell in row) for row in cells[:MOST_ABOVE]]
+        named = {cell: bool(understand(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
+        roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
         filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
         above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]

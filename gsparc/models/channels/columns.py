@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import LIGHT, Measurements, Site
-from gsparc.models.image_sources.run_factors import aligning, run_quadratic
+from gsparc.models.run_factors import aligning, run_quadratic
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
 from gsparc.processes.factor import Factor

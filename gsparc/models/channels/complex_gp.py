@@ -23,8 +23,8 @@ from gsparc.data.links.stations import numbered
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.image_sources.run_factors import RunFactors, run_factors
 from gsparc.models.method import Method, Prediction
+from gsparc.models.run_factors import RunFactors, run_factors
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, WaveKernel

@@ -27,8 +27,8 @@ from gsparc.models.channels.covariance import (
     specular,
 )
 from gsparc.models.conditional import ConditionalField, LeftOutRows
-from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import Prediction
+from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.run_factors import run_factors
 from gsparc.models.image_sources.scene import Scene
+from gsparc.models.run_factors import run_factors
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 

@@ -12,7 +12,7 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.complex_gp import ComplexGP
-from gsparc.models.image_sources.run_factors import run_factors
+from gsparc.models.run_factors import run_factors
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext

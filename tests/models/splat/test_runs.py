@@ -16,8 +16,8 @@ from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.scores import score, unseen_runs
 from gsparc.models import loading
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.image_sources.run_factors import RunFactors
 from gsparc.models.method import Method, Prediction
+from gsparc.models.run_factors import RunFactors
 from gsparc.training.context import FitContext
 
 
