@@ -58,8 +58,8 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
         only = "; only gsparc locate takes it" if name == "fingerprints" else ""
         raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule{only}")
-    own = "align" in _parameters(kind)  # Argos turns snapshots by their uplink
-    free = "auto" if own else str(settings.pop("align", None) or "auto")
+    has_own = "align" in _parameters(kind)  # Argos turns snapshots by their uplink
+    free = "auto" if has_own else str(settings.pop("align", None) or "auto")
     settings = _checked(settings, kind)
     try:  # under its key, which errors then name
         module = instantiate({"dataset": settings}, _convert_="all")["dataset"]

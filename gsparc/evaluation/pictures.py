@@ -31,8 +31,8 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
         draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
-    known = [said.confidence for _, _, said in told]
-    confidence = None if known[0] is None else np.concatenate([one.numpy() for one in known])[back]
+    known = [said.confidence.numpy() for _, _, said in told if said.confidence is not None]
+    confidence = np.concatenate(known)[back] if known else None
     return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 

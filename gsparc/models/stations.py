@@ -35,9 +35,9 @@ class LearnsTogether(Method):
     init: InitSettings
 
     def shares(self, site: Site) -> bool:
-        """Received powers, and channels of a known carrier."""
+        """Received powers, and channels of a known carrier in its own gauge."""
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
-        return waves or site.kind == "rssi"
+        return (waves and site.gauge != "free") or site.kind == "rssi"
 
     def best_stations(
         self, data: Measurements, fold: Fold, context: FitContext
