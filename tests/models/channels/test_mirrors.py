@@ -9,6 +9,7 @@ from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.models.channels.columns import gather
 from gsparc.models.channels.covariance import Shape, Values, disturbance, mirrored, signals
 from gsparc.models.channels.evidence import compressed, normalised
@@ -139,7 +140,7 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
                 where = torch.from_numpy(end[number] - data.site.origin).expand(len(place), 3)
                 turned = torch.eye(3).expand(len(place), 3, 3)
                 moving = torch.from_numpy(place - data.site.origin)
-                told_of = field(moving, Pose(where, turned)).mean.reshape(-1).numpy()
+                told_of = field(Query(moving, Pose(where, turned))).mean.reshape(-1).numpy()
                 true = channel[:, number]
                 scale = np.vdot(told_of, true) / np.vdot(told_of, told_of).real
                 own.append(nmse(scale * told_of, true))
