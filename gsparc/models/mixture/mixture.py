@@ -41,9 +41,12 @@ class Mixture(ConditionalField):
             self.held = members[0].held
 
     def parts(self) -> Iterator[tuple[float, ConditionalField]]:
-        """See `ConditionalField`."""
+        """Fields that are no mixtures, with their weights in the mean."""
         for weight, one in zip(self.weights, self.members, strict=True):
-            yield from ((weight * more, part) for more, part in one.parts())
+            if isinstance(one, Mixture):
+                yield from ((weight * more, part) for more, part in one.parts())
+            else:
+                yield weight, one
 
     @property
     def count(self) -> int:
