@@ -17,6 +17,7 @@ class Snapshots:
         rows: (S,) of the measurements.
         moment: (S,) int64, which moment a row is of.
         antenna: (S,) int64, the first antenna of a row's station.
+        stations: (T,) int64 numbers of the stations that antennas are of, one after the other.
         places: (n, D) [m] of what moves.
         values: (n, A, K) complex128, 0 where nothing was measured.
         tones: (K,) [Hz], relative to their mean.
@@ -26,6 +27,7 @@ class Snapshots:
     rows: np.ndarray
     moment: np.ndarray
     antenna: np.ndarray
+    stations: np.ndarray
     places: np.ndarray
     values: np.ndarray
     tones: np.ndarray
@@ -35,11 +37,7 @@ class Snapshots:
     def of(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
         """Of rows (S,): the i-th visit of each station to a place is one moment."""
         station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-        moment = np.arange(len(rows))
-        if data.station is not None and data.place is not None:
-            visit = _visits(data.place[rows], station)
-            _, moment = np.unique(np.c_[data.place[rows], visit], axis=0, return_inverse=True)
-            moment = moment.reshape(-1)
+        moment = moments(data, rows)
         _, first = np.unique(moment, return_index=True)
         target = np.asarray(data.target[rows])
         if data.mask is not None:
@@ -51,7 +49,14 @@ class Snapshots:
         run = np.zeros(len(first), np.int64) if data.run is None else data.run[rows[first]]
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
         one = cls(
-            rows, moment, column * target.shape[1], data.moving[rows[first]], empty, tones - tones.mean(), run
+            rows,
+            moment,
+            column * target.shape[1],
+            names,
+            data.moving[rows[first]],
+            empty,
+            tones - tones.mean(),
+            run,
         )
         return replace(one, values=one.arranged(target))
 
@@ -65,6 +70,14 @@ class Snapshots:
     def to_rows(self, factors: np.ndarray) -> np.ndarray:
         """Factors (S, 1, K) of rows, by those (n, K) of moments."""
         return factors[self.moment][:, None]
+
+
+def moments(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Numbers (S,) of the moments of rows; without stations, or places in common, each has its own."""
+    if data.station is None or data.place is None:
+        return np.arange(len(rows))
+    visit = _visits(data.place[rows], data.station[rows])
+    return np.unique(np.c_[data.place[rows], visit], axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _visits(place: np.ndarray, station: np.ndarray) -> np.ndarray:

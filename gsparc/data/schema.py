@@ -114,8 +114,8 @@ class Site:
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
         unit: that powers were given in, and are answered in; None: `level_unit`.
         freedom: what of each row's factor nobody knows, see `gsparc.physics.row_factors`.
-        gauge: of rows that were turned to each other: `carrier`, their phases over places are those of
-            waves; `free`, neighbours were made alike. None where rows are as measured.
+        phase_reference: of rows that were turned to each other: `carrier`, phases over places are those of
+            waves; `neighbours`, near rows were made alike. None where rows are as measured.
     """
 
     name: str
@@ -143,7 +143,7 @@ class Site:
     level_unit: str = "dB"
     unit: str | None = None
     freedom: Freedom = "none"
-    gauge: Literal["carrier", "free"] | None = None
+    phase_reference: Literal["carrier", "neighbours"] | None = None
 
     @property
     def scored(self) -> Scored:

@@ -227,6 +227,8 @@ def aligned(data: Measurements, site: Site) -> Measurements:
         if here != there:
             raise ValueError(f"the model was trained with {what} {there}, {own.name} has {here}")
     data = _about(data, site)
+    if site.freedom != "none":  # few rows of another file may not tell
+        data = replace(data, site=replace(data.site, freedom=site.freedom))
     own = data.site
     shift = own.origin - site.origin
     if own.static_position is not None and site.static_position is not None:

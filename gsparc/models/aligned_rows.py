@@ -2,9 +2,9 @@
 
 With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree of
 near places, then each to what a process of all other rows says of it, in turns with the process's settings.
-Many gauges fit: phases that vary slowly over places are as good as the carrier's ("free"), unless antennas at
-known places see the same factor, which leaves one gauge alone, that of waves ("carrier"); the one that
-predicts rows left out better, after the same freedom, is taken.
+Many phases fit: those that vary slowly over places ("neighbours") are as good as the carrier's, unless
+several antennas at known places see the same factor: then only phases of waves ("carrier") fit all of them.
+What predicts rows left out better, after the same freedom, is taken.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.data.moments import Snapshots
+from gsparc.data.moments import Snapshots, moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning, words
@@ -33,11 +34,12 @@ from gsparc.processes.two_lengths import first_kernel, two_lengths
 log = logging.getLogger(__name__)
 
 NEIGHBOURS = 50  # rows that tell of a row
+AT_ONCE = 4_096  # rows whose weights are solved together: memory
 TREE = 2_000  # rows of the spanning tree; others hang on the nearest of these
 ROUNDS, SWEEPS = 6, 10
 WAVE_SWEEPS = 40
 WAVE_NOISE = 0.1  # of the signal's power
-ANTENNAS = 4  # with one factor, from which on waves leave one gauge
+ANTENNAS = 4  # with one factor, from which on only phases of waves fit all
 SHARED = 0.5  # of antennas heard at a moment, from which on stations have their factors in common
 SPACINGS = 4.0  # median distances to the next row that stand for a wavelength where none is known
 
@@ -49,52 +51,61 @@ class Alignment:
     Attributes:
         factors: (n, K) complex128.
         error: of rows predicted from the others after the same freedom, relative to their power.
-        gauge: `carrier`, phases over places are those of waves; `free`, neighbours were made alike.
+        phase_reference: see `Site`.
     """
 
     factors: np.ndarray
     error: float
-    gauge: Literal["carrier", "free"]
+    phase_reference: Literal["carrier", "neighbours"]
 
 
-def in_one_gauge(data: Measurements, fold: Fold) -> Measurements:
+def with_common_phase(data: Measurements, fold: Fold) -> Measurements:
     """The measurements with training and validation rows turned to each other; as they are where that is so.
 
     Rows keep what `site.freedom` leaves them; test rows are not looked at.
     """
     site = data.site
-    if site.freedom == "none" or site.gauge is not None:
+    if site.freedom == "none" or site.phase_reference is not None:
         return data
     known = np.sort(np.concatenate([fold.train, fold.val]))
     key = (known.tobytes(), site.sha256)
     for reference, its, result in _LAST:
         if reference() is data and its == key:
             return result
-    target, found = np.array(data.target), []
+    target, noise, found = np.array(data.target), data.noise_variance, []
     for rows in _parts(data, known):
         best, own = align(rows, site.freedom, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
-            factors = factors / np.maximum(_rms(rows.values), 1e-30)[rows.moment][:, None, None]
+            level = np.maximum(_rms(rows.values), 1e-30)[rows.moment]
+            factors = factors / level[:, None, None]
+            if noise is not None:
+                noise = np.array(noise)
+                noise[rows.rows] /= level**2
         target[rows.rows] = (own * factors).astype(target.dtype)
-    gauge: Literal["carrier", "free"] = "carrier" if all(one.gauge == "carrier" for one in found) else "free"
+    reference: Literal["carrier", "neighbours"] = (
+        "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
+    )
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
         len(known), words(site.freedom), float(np.mean([one.error for one in found])),
-        "the carrier's" if gauge == "carrier" else "free",
+        "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
-    result = replace(data, target=target, run=None, site=replace(site, gauge=gauge))
+    result = replace(
+        data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
+    )
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
 
 
 def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
     """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
-    whole = Snapshots.of(data, known)
-    if data.station is None or (whole.values != 0).mean() >= SHARED:
-        return [whole]
-    return [Snapshots.of(data, known[data.station[known] == one]) for one in np.unique(data.station[known])]
+    numbers = np.zeros(len(known), np.int64) if data.station is None else data.station[known]
+    stations = np.unique(numbers)
+    if len(known) >= SHARED * len(stations) * (moments(data, known).max() + 1):
+        return [Snapshots.of(data, known)]
+    return [Snapshots.of(data, known[numbers == one]) for one in stations]
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
@@ -107,7 +118,7 @@ _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, str], Measurements]] =
 
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
-    """The best of a free gauge and, where several antennas tell, the carrier's."""
+    """The better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
@@ -158,7 +169,7 @@ class _Rows:
         kernel, found = first_kernel(self.length), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
-            found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "free"))
+            found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "neighbours"))
             turned = (self.values * factors[:, None]).reshape(len(factors), -1)
             kernel = two_lengths(self.places, turned, self.length, kernel)
         return min(found, key=lambda each: each.error)
@@ -169,29 +180,32 @@ class _Rows:
         factors = self._swept(factors, weights, WAVE_SWEEPS)
         return Alignment(factors, self._error(factors, weights), "carrier")
 
-    def _weights(self, kernel: Kernel | WaveKernel) -> tuple[np.ndarray, np.ndarray]:
-        """Neighbours (n, k) of each row and their weights in what the others say of it."""
+    def _weights(self, kernel: Kernel | WaveKernel) -> csr_array:
+        """Weights (n, n) of the neighbours of each row in what the others say of it."""
         index = cKDTree(self.places).query(self.places, k=min(NEIGHBOURS + 1, len(self.places)))[1]
         mine = index == np.arange(len(index))[:, None]
         mine[~mine.any(1), -1] = True  # of many rows at one place, itself is not among the nearest
         near = index[~mine].reshape(len(index), -1)
-        at, around = torch.from_numpy(self.places), torch.from_numpy(self.places[near])
-        noise = torch.full(near.shape, float(kernel.noise), dtype=torch.float64)
-        return near, weights_of(kernel, at, around, noise)[0].numpy()
+        weight = np.empty(near.shape)
+        for part in np.array_split(np.arange(len(near)), -(-len(near) // AT_ONCE)):
+            at, around = torch.from_numpy(self.places[part]), torch.from_numpy(self.places[near[part]])
+            noise = torch.full(around.shape[:2], float(kernel.noise), dtype=torch.float64)
+            weight[part] = weights_of(kernel, at, around, noise)[0].numpy()
+        count, starts = len(near), np.arange(len(near) + 1) * near.shape[1]
+        return csr_array((weight.ravel(), near.ravel(), starts), (count, count))
 
-    def _told(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    def _told(self, factors: np.ndarray, weights: csr_array) -> np.ndarray:
         """Rows (n, A, K) as the others say."""
-        near, weight = weights
         turned = self.values * factors[:, None]
-        return np.einsum("nk,nkat->nat", weight, turned[near])
+        return (weights @ turned.reshape(len(turned), -1)).reshape(turned.shape)
 
-    def _swept(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray], sweeps: int) -> np.ndarray:
+    def _swept(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
             told = self._told(factors, weights)
             factors = turning(self.values, told, self.tones, self.freedom_of_phase)
         return factors
 
-    def _error(self, factors: np.ndarray, weights: tuple[np.ndarray, np.ndarray]) -> float:
+    def _error(self, factors: np.ndarray, weights: csr_array) -> float:
         told = self._told(factors, weights)
         told = told * turning(told, self.values, self.tones, self.freedom)[:, None]
         missed = np.abs(self.values - told) ** 2 * (self.values != 0)
@@ -208,9 +222,7 @@ def _direct(rows: Snapshots, site: Site) -> np.ndarray | None:
     if site.wavelength is None or rows.values.shape[1] < ANTENNAS or rows.places.shape[1] != 3:
         return None
     if site.stations is not None:
-        names = np.unique(rows.antenna)
-        count = rows.values.shape[1] // max(len(names), 1)
-        ends = np.repeat(site.stations.position[: len(names)], count, axis=0)
+        ends = site.stations.position[rows.stations]
     elif site.array is not None and site.static_position is not None and site.static_end == "rx":
         turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
         ends = site.static_position + site.array @ turned.T

@@ -13,10 +13,8 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
-from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels import field as channels
 from gsparc.models.channels import initial as waves
-from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.directional.method import DirectionalGP
@@ -24,7 +22,7 @@ from gsparc.models.image_sources.known.images import counted
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import RayField, SourceField
-from gsparc.models.method_field import AlignedField, ProcessField
+from gsparc.models.method_field import AlignedField, MethodField, ProcessField
 from gsparc.models.mixture.mixture import Mixture, residuals
 from gsparc.models.moving_array.bearing_field import BearingField
 from gsparc.models.moving_array.method import MovingArrayField
@@ -133,22 +131,17 @@ def bearings(
     return BearingField(method, heard(data, rows)), report
 
 
-def process(
-    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
-) -> tuple[ConditionalField, FitReport]:
-    """The plain process on whole targets; `init` and `clutter` mean nothing to it."""
-    method = GaussianProcess()
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
-    return ProcessField(method), report
+def _fitted_as(kind: type[MethodField]) -> Callable[..., tuple[ConditionalField, FitReport]]:
+    """The method of a field on whole targets; `init` and `clutter` mean nothing to it."""
 
+    def initialise(
+        data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+    ) -> tuple[ConditionalField, FitReport]:
+        method = kind.makes()
+        report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+        return kind(method), report
 
-def aligned(
-    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
-) -> tuple[ConditionalField, FitReport]:
-    """A process of two lengths on rows that were turned to each other; `init` and `clutter` mean nothing."""
-    method = ComplexGP()
-    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
-    return AlignedField(method), report
+    return initialise
 
 
 def _completed(
@@ -189,8 +182,8 @@ INITIALISERS: dict[str, Callable[..., tuple[ConditionalField, FitReport]]] = {
     "powers": powers,
     "joint_powers": joint_powers,
     "bearings": bearings,
-    "process": process,
-    "aligned": aligned,
+    "process": _fitted_as(ProcessField),
+    "aligned": _fitted_as(AlignedField),
 }
 # `(site, state) -> field` by the kind that a state names.
 RESTORED: dict[str, Callable[[Site, dict[str, Any]], ConditionalField]] = {

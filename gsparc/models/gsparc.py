@@ -46,7 +46,7 @@ def plan(
     waves = ("diffuse",) if plain and init.snapshot == "none" else ()  # offsets are known to sources alone
     residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
     table: tuple[tuple[bool, tuple[str, ...]], ...] = (
-        (site.gauge == "free", ("aligned",)),  # rows were turned to each other: no phase tells of paths
+        (site.phase_reference == "neighbours", ("aligned",)),  # no phase tells of paths
         (terms.power and init.name == "scene", ("scene",)),  # known walls and a process
         (terms.power and several, ("joint_powers",)),  # a law of the site and a process of each station
         (terms.power, ("powers",)),  # a process of decibels about a distance law

@@ -72,10 +72,8 @@ class ProcessField(MethodField):
     terms = ("residual",)  # type: ignore[assignment]
 
 
-class AlignedField(MethodField):
-    """A process of rows that were turned to each other, without any Gaussians."""
+class AlignedField(ProcessField):
+    """`complex_gp` of rows that were turned to each other."""
 
     kind = "aligned"
     makes = ComplexGP
-    count = 0  # type: ignore[assignment]
-    terms = ("residual",)  # type: ignore[assignment]

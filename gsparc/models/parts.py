@@ -22,7 +22,7 @@ from gsparc.data.errors import some
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
-from gsparc.models.aligned_rows import in_one_gauge
+from gsparc.models.aligned_rows import with_common_phase
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.training.context import FitContext, FitReport
@@ -39,7 +39,7 @@ CHANGEABLE = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (
     "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
-    "uplink_array", "uplink_hz", "antennas",
+    "uplink_array", "uplink_hz", "antennas", "freedom",
 )  # fmt: skip
 """Facts of a site that the content hash of its measurements leaves out."""
 
@@ -58,7 +58,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         ValueError: the folder holds a part of other data, rows, seed or settings.
     """
     budget = TimeBudget()
-    data, left = in_one_gauge(data, fold), context.resume
+    data, left = with_common_phase(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count("*")
@@ -69,7 +69,10 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
     report = method.fit(data, fold, context)
-    return replace(report, seconds=report.seconds + aligning) if aligning else report
+    if not aligning:
+        return report
+    cost = Cost({"alignment": aligning}) + report.cost
+    return replace(report, seconds=report.seconds + aligning, cost=cost)
 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:

@@ -121,10 +121,17 @@ class PlannedField(LearnedField):
         with heeded.apart() as asked:
             std = data.position_std if self.position_std is None else np.full(len(data), self.position_std)
         if std is not None and std[np.concatenate([fold.train, fold.val])].any():
-            if not self.plan.rasterized and data.site.kind != "spectrum" and data.site.static_end is not None:
+            site, phases = data.site, data.site.phase_reference != "neighbours"
+            if (
+                not self.plan.rasterized
+                and site.kind != "spectrum"
+                and site.static_end is not None
+                and phases
+            ):
                 heeded.count(*asked)
                 return self._fit_refined(self.plan, data, fold, context, std)
-            log.warning("position_std is not used: it is for channels and powers of one end that moves")
+            what = "channels with phases of the carrier and powers, of one end that moves"
+            log.warning("position_std is not used: it is for %s", what)
         if self.plan.rasterized:
             return self._fit_rasterized(data, fold, context)
         return self._fit_conditional(self.plan, data, fold, context)
@@ -225,7 +232,7 @@ class PlannedField(LearnedField):
     def shares(self, site: Site) -> bool:
         """Received powers, and channels of a known carrier."""
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
-        return (waves and site.gauge != "free") or site.kind == "rssi"
+        return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""

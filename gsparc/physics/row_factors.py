@@ -15,6 +15,7 @@ Freedom = Literal["none", "phase", "phase+delay", "phase+delay+gain"]
 FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
 FINE = 8  # delays tried within one over the bandwidth
 MOST_DELAYS = 1024
+AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
 def words(freedom: Freedom) -> str:
@@ -47,6 +48,9 @@ def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedo
     """
     if freedom == "none":
         return np.ones((len(values), len(tones)), np.complex128)
+    if len(values) > AT_ONCE:
+        parts = np.array_split(np.arange(len(values)), -(-len(values) // AT_ONCE))
+        return np.concatenate([turning(values[part], reference[part], tones, freedom) for part in parts])
     product = (values * reference.conj()).sum(1)
     slope = np.zeros(len(values))
     tried = delays(tones) if freedom != "phase" else np.zeros(1)

@@ -1,4 +1,4 @@
-"""Rows with factors of their own: what is told of them after the same freedom, and the carrier's gauge."""
+"""Rows with factors of their own: what is told of them after the same freedom, and the carrier's phase."""
 
 from dataclasses import replace
 
@@ -8,8 +8,14 @@ import pytest
 
 from gsparc.data.checks.coherence import allowed
 from gsparc.data.moments import Snapshots
-from gsparc.models.aligned_rows import align, in_one_gauge
+from gsparc.data.schema import Stations
+from gsparc.evaluation.open_runs import aligned
+from gsparc.models import aligned_rows, parts
+from gsparc.models.aligned_rows import align, with_common_phase
+from gsparc.models.gsparc import Gsparc
+from gsparc.physics import row_factors
 from gsparc.physics.row_factors import turning
+from gsparc.training.context import FitContext
 
 pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
 
@@ -24,24 +30,24 @@ def logged():
 
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
     fold = packets.shares(logged, 0)
-    aligned = in_one_gauge(logged, fold)
-    assert aligned.site.gauge == "free" and aligned.site.freedom == "phase+delay"
-    assert (aligned.target[fold.test] == logged.target[fold.test]).all()
-    assert np.allclose(np.abs(aligned.target), np.abs(logged.target), rtol=1e-4)
+    turned = with_common_phase(logged, fold)
+    assert turned.site.phase_reference == "neighbours" and turned.site.freedom == "phase+delay"
+    assert (turned.target[fold.test] == logged.target[fold.test]).all()
+    assert np.allclose(np.abs(turned.target), np.abs(logged.target), rtol=1e-4)
     other = np.array(logged.target)
     other[fold.test] = 0
-    again = in_one_gauge(replace(logged, target=other), fold)
-    assert (again.target[fold.train] == aligned.target[fold.train]).all()
-    assert in_one_gauge(aligned, fold) is aligned
+    again = with_common_phase(replace(logged, target=other), fold)
+    assert (again.target[fold.train] == turned.target[fold.train]).all()
+    assert with_common_phase(turned, fold) is turned
 
 
 def test_rows_that_are_coherent_stay_as_they_are():
     data = packets.measurements(*packets.robot())
     assert allowed(data, "auto") is data
-    assert in_one_gauge(data, packets.shares(data, 0)) is data
+    assert with_common_phase(data, packets.shares(data, 0)) is data
 
 
-def test_antennas_at_known_places_leave_the_carriers_gauge():
+def test_antennas_at_known_places_bring_the_carriers_phase_back():
     """A phase of each row's own before 12 antennas: phases over places come back but for one of all rows."""
     draw, wavelength = np.random.default_rng(0), 0.326
     places = np.c_[draw.uniform(0, 1.0, (150, 2)), np.full(150, 0.8)]
@@ -52,12 +58,12 @@ def test_antennas_at_known_places_leave_the_carriers_gauge():
     phase = np.exp(2j * np.pi * draw.uniform(size=150))
     site = replace(_site(), carrier_hz=299792458 / wavelength, array=antennas, static_position=np.zeros(3))
     rows = Snapshots(
-        np.arange(150), np.arange(150), np.zeros(150, int), places, (channel * phase[:, None])[..., None],
-        np.zeros(1), np.zeros(150, int),
+        np.arange(150), np.arange(150), np.zeros(150, int), np.zeros(1, int), places,
+        (channel * phase[:, None])[..., None], np.zeros(1), np.zeros(150, int),
     )  # fmt: skip
     found = align(rows, "phase", site)
     left = found.factors[:, 0] * phase
-    assert found.gauge == "carrier" and abs(left.mean()) > 0.95
+    assert found.phase_reference == "carrier" and abs(left.mean()) > 0.95
 
 
 def _site():
@@ -68,7 +74,41 @@ def _site():
 def test_a_free_gain_is_a_unit_row(logged):
     free = replace(logged, site=replace(logged.site, freedom="phase+delay+gain"))
     fold = packets.shares(free, 0)
-    target = in_one_gauge(free, fold).target[fold.train]
+    target = with_common_phase(free, fold).target[fold.train]
     assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(np.abs(free.target[fold.train]).mean((1, 2)))
     told = turning(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
     assert np.allclose(np.abs(told), 2, rtol=1e-3)
+
+
+def test_rows_in_parts_are_turned_as_all_at_once(logged, monkeypatch):
+    """Ten thousand rows of 64 tones before four antennas took 8 GB."""
+    whole = align(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    monkeypatch.setattr(aligned_rows, "AT_ONCE", 64)
+    monkeypatch.setattr(row_factors, "AT_ONCE", 64)
+    again = align(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    assert np.allclose(again.factors, whole.factors)
+
+
+def test_stations_that_are_missing_took_the_places_of_others():
+    """The direct wave of the second and third station was that of the first and second."""
+    stations = Stations(np.c_[np.arange(6.0), np.zeros(6), np.full(6, 2.0)], tuple("abcdef"))
+    site = replace(_site(), stations=stations, static_position=None)
+    rows = Snapshots(
+        np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), np.arange(1, 6), np.ones((2, 3)),
+        np.ones((2, 5, 1), complex), np.zeros(1), np.zeros(2, int),
+    )  # fmt: skip
+    away = np.linalg.norm(np.ones(3) - stations.position[1:], axis=1)
+    expected = np.exp(-2j * np.pi / site.wavelength * away)
+    assert np.allclose(aligned_rows._direct(rows, site)[0, :, 0], expected)
+
+
+def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
+    fold = packets.shares(logged, 0)
+    method = Gsparc(position_std=0.001)
+    parts.fit(method, logged, fold, FitContext())
+    assert "position_std is not used" in caplog.text and method.made.startswith("aligned")
+
+
+def test_another_file_is_scored_after_the_freedom_of_the_model(logged):
+    few = logged.subset(np.arange(8), replace(logged.site, freedom="none"))
+    assert aligned(few, logged.site).site.freedom == "phase+delay"

@@ -8,7 +8,7 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.fields import process as initialise
+from gsparc.models.fields import INITIALISERS
 from gsparc.models.method_field import ProcessField
 from gsparc.models.mixture.solutions import weighed
 from gsparc.training.context import FitContext
@@ -18,7 +18,7 @@ ROWS = np.arange(0, 160, 2)
 
 def test_it_answers_as_the_process_does_and_is_read_back():
     data = room_of_spectra()
-    field, _ = initialise(data, ROWS, InitSettings(), True, FitContext())
+    field, _ = INITIALISERS["process"](data, ROWS, InitSettings(), True, FitContext())
     plain, batch = GaussianProcess(), data.batch(np.arange(1, 160, 10))
     plain.fit(data, Fold(ROWS, ROWS[:0], ROWS[:0]), FitContext())
     found, said = field(batch), plain.predict(batch)
@@ -31,8 +31,8 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     """Bearings of a moving array were weighed against nothing."""
     data = room_of_spectra()
     few = np.arange(0, 24)
-    good, _ = initialise(data, few, InitSettings(), True, FitContext())
-    spoilt, _ = initialise(data, few, InitSettings(), True, FitContext())
+    good, _ = INITIALISERS["process"](data, few, InitSettings(), True, FitContext())
+    spoilt, _ = INITIALISERS["process"](data, few, InitSettings(), True, FitContext())
     spoilt.method.mean = spoilt.method.mean + 0.3
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_inside(data, fold, None, 3, 0)

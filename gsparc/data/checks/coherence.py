@@ -67,7 +67,8 @@ def coherence(data: Measurements) -> Coherence | None:
     site = data.site
     if site.kind != "csi" or site.wavelength is None or data.uplink is not None:
         return None
-    few = max(MOST_ENTRIES // data.target[0].size, 1)
+    stations = 1 if site.stations is None else len(site.stations)
+    few = max(MOST_ENTRIES // (stations * data.target[0].size), 1)
     rows = Snapshots.of(data, np.arange(min(len(data), few)))
     if rows.values[0].size < 2:
         return None

@@ -86,9 +86,9 @@ class ComplexGP(Method):
         return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
     def _kernels(self, places: Tensor, values: Tensor) -> Iterator[WaveKernel | Kernel]:
-        """Candidates for values (n, R) at places (n, D) [m]; two lengths in a free gauge."""
+        """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""
         assert self.site is not None and self.site.wavelength is not None
-        if self.site.gauge == "free":
+        if self.site.phase_reference == "neighbours":
             kernel, rows = first_kernel(self.site.wavelength), (places.numpy(), values.numpy())
             for _ in range(REFINED):
                 kernel = two_lengths(*rows, self.site.wavelength, kernel)
