@@ -16,9 +16,10 @@ from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
 from gsparc.data.tables.columns import Chosen, choose, station_names
 from gsparc.data.tables.heads import AXES
+from gsparc.data.tables.opening import sheet_of
 from gsparc.data.tables.places import Places, places
 from gsparc.data.tables.read import NOTHING
-from gsparc.data.tables.sheet import Sheet, sheet_of
+from gsparc.data.tables.sheet import Sheet
 
 GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
 

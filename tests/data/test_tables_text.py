@@ -7,7 +7,7 @@ import pytest
 
 from gsparc.data.files import read_csv
 from gsparc.data.own import interpret
-from gsparc.data.tables import sheet
+from gsparc.data.tables import opening
 from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
@@ -92,11 +92,11 @@ def test_a_comment_mark_after_an_empty_cell_was_a_crash(write, refused):
 )
 def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch, content, says):
     """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
-    monkeypatch.setattr(sheet, "MOST_CELLS", 30_000)
+    monkeypatch.setattr(opening, "MOST_CELLS", 30_000)
     start = time.process_time()
     refused(says, understand_table, write(content))
     assert time.process_time() - start < 5
-    monkeypatch.setattr(sheet, "MOST_BYTES", 1000)
+    monkeypatch.setattr(opening, "MOST_BYTES", 1000)
     refused("a table of text of more than 1,000 bytes; write it as Parquet", understand_table, write(content))
 
 

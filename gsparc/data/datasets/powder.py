@@ -83,8 +83,8 @@ def _of_npz(path: Path) -> Raw:
 
 def _of_csv(path: Path, table: Path) -> Raw:
     from gsparc.data.tables.columns import Column  # here, as pandas takes half a second to import
+    from gsparc.data.tables.opening import sheet_of
     from gsparc.data.tables.places import places
-    from gsparc.data.tables.sheet import sheet_of
 
     (sheet, _), stations = sheet_of(path), station_places(table)
     missing = [head for head in (LATITUDE, LONGITUDE) if head not in sheet.heads]

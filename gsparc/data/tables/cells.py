@@ -10,7 +10,8 @@ from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE
 from gsparc.data.tables.columns import Chosen, Column
 from gsparc.data.tables.heads import AXES, KINDS
-from gsparc.data.tables.sheet import Sheet, opened
+from gsparc.data.tables.opening import opened
+from gsparc.data.tables.sheet import Sheet
 
 LOOKED_AT = 10_000  # rows by which columns are understood
 METRES = 111_320.0  # of a degree of latitude

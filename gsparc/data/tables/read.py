@@ -30,6 +30,7 @@ from gsparc.data.tables.columns import (
     station_names,
 )
 from gsparc.data.tables.heads import PERCENT, words_of
+from gsparc.data.tables.opening import read_parquet, sheet_of
 from gsparc.data.tables.places import (
     PER_STATION,
     UNKNOWN_HEIGHT,
@@ -39,7 +40,7 @@ from gsparc.data.tables.places import (
     places,
     read_stations,
 )
-from gsparc.data.tables.sheet import Sheet, read_parquet, sheet_of
+from gsparc.data.tables.sheet import Sheet
 from gsparc.data.tables.slots import unfolded
 from gsparc.data.tables.splitting import splitting
 

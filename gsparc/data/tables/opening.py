@@ -1,0 +1,380 @@
+"""From files, of text or Parquet, to `Sheet`: delimiters, banners, comments, decimal marks, limits."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+from fsspec.core import url_to_fs
+
+from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
+from gsparc.data.files import Several, checked_line
+from gsparc.data.tables import TABLE_SUFFIXES
+from gsparc.data.tables.heads import understand
+from gsparc.data.tables.sheet import Sheet
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
+
+
+@contextmanager
+def opened(source: str) -> Iterator[Dataset]:
+    """The dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
+
+    Raises:
+        DataError: pyarrow is missing, or a file is damaged, also while it is read in the block.
+    """
+    try:
+        from pyarrow import ArrowException, dataset
+    except ImportError:
+        raise DataError(f"{source}: Parquet needs pyarrow; say: pip install 'gsparc[tables]'") from None
+    try:
+        system, at = url_to_fs(source) if "://" in source else (None, source)
+        yield dataset.dataset(at, filesystem=system, format="parquet", partitioning="hive")
+    except (ArrowException, OSError, ValueError, ImportError) as error:
+        raise DataError(f"{source}: damaged or not a Parquet file ({reason(error)})") from None
+
+
+def read_parquet(source: str, most: int | None = None) -> Sheet:
+    """The columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
+    with opened(source) as files:
+        frame = (files.to_table() if most is None else files.head(most)).to_pandas()
+    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
+    frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
+    if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
+        frame = frame.reset_index(allow_duplicates=True)
+    heads = tuple(str(name) for name in frame.columns)
+    twice = [name for name in heads if heads.count(name) > 1]
+    if twice:
+        raise DataError(f"{source}: two columns are named {twice[0]!r}; rename one")
+    if not len(frame):
+        raise DataError(f"{source}: no rows")
+    rows = tuple(f"row {i}" for i in range(len(frame)))
+    columns = tuple(frame.iloc[:, i] for i in range(len(heads)))
+    return Sheet(source, heads, columns, rows, problems=Problems(source))
+
+
+DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
+DECIMAL_POINT = r"\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*"
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
+LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
+COMMENTS = ("#", "%", "//")
+# What files of other kinds begin with: the name may say .csv all the same.
+OTHERS = {
+    b"PK\x03\x04": "an Excel workbook or another zip archive; save it as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save it as CSV",
+    b"PAR1": "a Parquet file; name it *.parquet",
+    b"\x1f\x8b": "compressed by gzip; unpack it first",
+    b"\x89HDF": "an HDF5 file; name it *.h5",
+    b"%PDF": "a PDF document; save the table as CSV",
+    b"<": "HTML or XML; save the table as CSV",
+    b"{": "JSON; save the table as CSV",
+    b"[{": "JSON; save the table as CSV",
+}
+
+
+MOST_BYTES = 2**30  # of a table of text
+MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
+MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
+
+
+Lines = dict[int, str]  # those with something in them, by their numbers from 1
+
+
+def read_text(path: Path) -> tuple[Sheet, list[str]]:
+    """The cells of a text file, and notes on what was recognised.
+
+    Raises:
+        DataError: empty, not text, no heads, ragged lines or two columns of one name.
+    """
+    source, notes = str(path), []
+    text, encoding = _decoded(path)
+    if encoding != "UTF-8":
+        notes.append(f"read as {encoding}")
+    lines, comment = _lines(MINUS.sub("-", text), source)
+    if not lines:
+        raise DataError(f"{source}: empty; expected a line of heads and rows below it")
+    lines, banner_notes = _without_banner(lines)
+    notes += banner_notes
+    excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
+    if excel:  # Excel's own hint
+        del lines[min(lines)]
+        comment = ""
+    delimiter = excel[1] if excel else _delimiter(list(lines.values()), comment)
+    if delimiter is None or not lines:
+        fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
+        raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
+    width = len(_cells(lines[min(lines)], delimiter))
+    if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
+        fault = (
+            f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,} cells"
+        )
+        raise DataError(f"{source}: {fault} are read: write Parquet, with dataset.cell_m where rows are many")
+    lines = _with_heads(lines, comment, delimiter, source)
+    lines, comment_notes = _without_comments(lines, delimiter, source)
+    lines, again_notes = _heads_once(lines)
+    notes += comment_notes + again_notes
+    heads, *rows = _rectangular(lines, delimiter, source)
+    heads = [cell.strip() for cell in heads]
+    for i, head in enumerate(heads):
+        if head and head in heads[:i]:
+            where = f"columns {heads.index(head) + 1} and {i + 1}"
+            hint = "; is there no line of heads?" if _is_number(head) else "; rename one"
+            raise DataError(f"{source}: {where} are both named {head!r}{hint}")
+    if not rows:
+        raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
+    frame = pd.DataFrame(rows, dtype=object)
+    decimal, decimal_notes = _decimal(text, frame, delimiter)
+    if delimiter != ",":
+        notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
+    notes += decimal_notes
+    columns = tuple(frame[i] for i in range(len(heads)))
+    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines)[1:], decimal), notes
+
+
+def _decoded(path: Path) -> tuple[str, str]:
+    """The text of a file and the name of its encoding."""
+    if path.stat().st_size > MOST_BYTES:
+        raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
+    content = path.read_bytes()
+    for start, what in OTHERS.items():
+        if content.lstrip().startswith(start):
+            raise DataError(f"{path}: not a table of text but {what}")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return content.decode("utf-16"), "UTF-16"
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
+    if b"\0" in content:
+        raise DataError(
+            f"{path}: not text (byte {content.index(0)} is zero; UTF-16 without its mark?); save it as UTF-8"
+        )
+    try:
+        return content.decode("utf-8-sig"), "UTF-8"
+    except UnicodeDecodeError:
+        # Every byte means something in Latin-1; Windows-1252 is what spreadsheets write.
+        return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
+
+
+def _lines(text: str, source: str) -> tuple[Lines, str]:
+    """The lines, and the last comment before the first of them."""
+    lines: Lines = {}
+    comment, number = "", 1
+    text = QUOTED.sub(_in_one_line, text) if '"' in text else text
+    # Not str.splitlines, which also ends lines at characters that may stand in a cell.
+    for line in re.split(BREAK, text):
+        stripped = checked_line(source, number, line).strip()
+        if stripped.startswith(COMMENTS) and not lines:
+            comment = stripped.lstrip("#%/ ")
+        elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
+            lines[number] = line.replace(BROKEN, " ")
+        number += 1 + line.count(BROKEN)
+    return lines, comment
+
+
+BREAK, BROKEN = r"\r\n|\n|\r", "\x1f"
+QUOTED = re.compile(r'(?m)(?:^|(?<=[,;\t|])) *"[^"]*(?:""[^"]*)*"(?= *(?:[,;\t|\r\n]|\Z))')
+MOST_BROKEN = 20  # lines of a cell: of more, a quotation mark was not closed
+
+
+def _in_one_line(cell: re.Match[str]) -> str:
+    """A quoted cell with `BROKEN` for breaks of lines; as it is where they are too many."""
+    one, count = re.subn(BREAK, BROKEN, cell[0])
+    return one if count < MOST_BROKEN else cell[0]
+
+
+MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s?[\d.,])")
+MOST_ABOVE = 10  # lines above the heads
+
+
+def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
+    """The lines from the heads on, where lines above them that hold something else leave no doubt; a note."""
+    numbers = list(lines)[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        cells = [_cells(lines[n], delimiter) for n in numbers]
+        usual = Counter(map(len, cells)).most_common(1)[0][0]
+        named = {cell: bool(understand(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
+        roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
+        first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
+        filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
+        above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
+        if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
+            kept = {n: line for n, line in lines.items() if n >= numbers[first]}
+            note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
+            return kept, [note]
+    return lines, []
+
+
+def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
+    """The lines without those that repeat the heads, as in files joined, and a note."""
+    first, *below = lines
+    line = lines[first].strip()
+    again = {n for n in below if lines[n].strip("\ufeff \t") == line}
+    if not again:
+        return lines, []
+    where = lines_of([f"line {n}" for n in sorted(again)])
+    what = Caution(f"{where}: the heads again; left out: are these files joined that belong together?")
+    return {n: text for n, text in lines.items() if n not in again}, [what]
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        line = " ".join(line.split())
+    if '"' not in line:
+        return line.split(delimiter)
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+
+
+def _delimiter(lines: list[str], comment: str) -> str | None:
+    """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
+    best: tuple[bool, float, int, str] | None = None
+    sample = lines[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        count = len(_cells(sample[0], delimiter))
+        named = _cells(comment, delimiter) if comment else []
+        heads = len(named) == count and any(understand(cell).role for cell in named)
+        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
+            continue
+        agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
+        if best is None or (heads, agree, count) > best[:3]:
+            best = (heads, agree, count, delimiter)
+    return None if best is None else best[3]
+
+
+def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Lines:
+    """The lines, the first of them heads; a comment before values is taken for them where it fits."""
+    first = _cells(lines[min(lines)], delimiter)
+    heads = _cells(comment, delimiter) if comment else []
+    named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
+    fits = len(heads) == len(first) and not all(map(_is_number, heads))
+    values = all(map(_is_number, first))
+    if not values and not (fits and named[0] > named[1]):
+        return lines
+    if fits:
+        return {min(lines) - 1: comment, **lines}
+    fault = f"line {min(lines)} holds numbers; expected the names of the columns above them"
+    raise DataError(f"{source}: {fault}")
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
+
+
+def _without_comments(lines: Lines, delimiter: str, source: str) -> tuple[Lines, list[str]]:
+    """The lines without comments below the heads, and a note.
+
+    A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
+    called #1; it is refused where it may be a row that somebody took out.
+    """
+    heads, *below = lines
+    marked = [n for n in below if lines[n].lstrip().startswith(COMMENTS)]
+    if not marked:
+        return lines, []
+    cells = {n: _cells(line, delimiter) for n, line in lines.items()}
+    like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]  # between spaces a mark may be a cell
+    if all(len(cells[heads]) != len(row) for row in (*like, *(cells[n] for n in marked))):
+        note = f"{len(marked)} comments below the heads, the first in line {marked[0]}"
+        return {n: line for n, line in lines.items() if n not in set(marked)}, [note]
+    first = {n: row[0].strip() for n, row in cells.items()}
+    plain = [first[n] for n in below if n not in set(marked)]
+    numbers = bool(plain) and all(map(_is_number, plain))
+    for n in marked:
+        mark = next((mark for mark in COMMENTS if first[n].startswith(mark)), "")  # none in an empty cell
+        name = first[n].removeprefix(mark).strip('"')
+        is_row = name.strip() and not name[0].isspace() and name not in first.values()
+        if not is_row or (numbers and _is_number(name)):
+            begin = (first[n] or lines[n].strip())[:20]
+            fault = f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
+            raise DataError(f"{source}, line {n}: {fault}")
+    at = f"the first in line {marked[0]}"
+    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, {at}"]
+
+
+def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
+    """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
+    for n, line in lines.items():
+        if line.count('"') % 2:
+            raise DataError(f"{source}, line {n}: a quotation mark is not closed; close it, or double it")
+    cells = [_cells(line, delimiter) for line in lines.values()]
+    count, *counts = map(len, cells)
+    if counts and len(set(counts)) == 1 and counts[0] != count:
+        hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
+        longer = cells[1:] if counts[0] > count else cells[:1]
+        if abs(counts[0] - count) == 1 and not any(row[-1].strip() for row in longer):
+            hint = ", the last of them empty: end heads and rows alike"
+        fault = f"{count} heads, but every line below has {counts[0]} cells{hint}"
+        raise DataError(f"{source}, line {min(lines)}: {fault}")
+    problems, below = Problems(source), list(lines)[1:]
+    names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
+    mark = DELIMITERS.get(delimiter, delimiter)
+    problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
+    problems.raise_if_any()
+    return cells
+
+
+def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[str]]:
+    """The mark that most numbers have that have one, and a note where it is a comma.
+
+    Between commas it can be one in quoted cells alone; where all cells with a comma may be marked between
+    thousands, the note asks.
+    """
+    if delimiter == "," and '"' not in text:
+        return ".", []
+    cells = pd.concat([frame[i] for i in frame.columns])
+    marked = cells[cells.str.fullmatch(DECIMAL_COMMA)]
+    thousands = bool(marked.str.fullmatch(THOUSANDS).all())
+    some = pd.concat([frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)] for i in frame.columns])
+    commas, points = (some.str.fullmatch(mark).sum() for mark in (DECIMAL_COMMA, DECIMAL_POINT))
+    if (delimiter == "," and thousands) or commas <= points:
+        return ".", []
+    if not thousands:
+        return ",", ["decimal commas"]
+    first = marked.iloc[0].strip()
+    hint = f"{first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+    return ",", [f"decimal commas: {hint}"]
+
+
+def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
+    """The cells of a table, and notes on what was recognised.
+
+    Args:
+        path: of the table.
+        problems: of another table, which take what is wrong with this one, too.
+
+    Raises:
+        DataError: no such file, another ending, or no table.
+    """
+    if isinstance(path, Several):
+        return _stacked([sheet_of(one, problems) for one in path.paths], path)
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
+    if path.suffix.lower() not in TABLE_SUFFIXES:
+        raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
+    sheet, notes = (read_parquet(str(path)), []) if path.suffix.lower() == ".parquet" else read_text(path)
+    return replace(sheet, problems=Problems(path) if problems is None else problems), notes
+
+
+def _stacked(parts: list[tuple[Sheet, list[str]]], source: str) -> tuple[Sheet, list[str]]:
+    """Rows of one table after those of the other; `DataError` where their columns differ."""
+    first = parts[0][0]
+    for sheet, _ in parts[1:]:
+        if set(sheet.heads) != set(first.heads) or sheet.decimal != first.decimal:
+            lacking = sorted(set(sheet.heads) ^ set(first.heads))[:3]
+            raise DataError(f"{sheet.source}: other columns than {first.source} has: {', '.join(lacking)}")
+    columns = (
+        pd.concat([sheet.columns[sheet.heads.index(head)] for sheet, _ in parts], ignore_index=True)
+        for head in first.heads
+    )
+    rows = tuple(f"{Path(sheet.source).name}, {row}" for sheet, _ in parts for row in sheet.rows)
+    notes = list(dict.fromkeys(note for _, own in parts for note in own))
+    return replace(first, source=source, columns=tuple(columns), rows=rows), notes
