@@ -69,8 +69,8 @@ def with_common_phase(data: Measurements, fold: Fold) -> Measurements:
         return data
     known = np.sort(np.concatenate([fold.train, fold.val]))
     key = (known.tobytes(), site.sha256)
-    for reference, its, result in _LAST:
-        if reference() is data and its == key:
+    for kept, its, result in _LAST:
+        if kept() is data and its == key:
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
     for rows in _parts(data, known):

@@ -67,7 +67,7 @@ class ProcessField(MethodField):
     """`gp` without any Gaussians, so that others are weighed against it on the same rows."""
 
     kind = "process"
-    makes = GaussianProcess
+    makes: ClassVar[type[Method]] = GaussianProcess
     count = 0  # type: ignore[assignment]
     terms = ("residual",)  # type: ignore[assignment]
 
