@@ -60,9 +60,8 @@ def errors_of(data: Measurements, fold: Fold, asked: float | None, heeds: bool) 
     if heeds:
         heeded.count("model.position_std")
         return std
-    log.warning(
-        "position_std is not used: it is for channels with phases of the carrier and powers, of one end that moves"
-    )
+    what = "channels with phases of the carrier and powers, of one end that moves"
+    log.warning("position_std is not used: it is for %s", what)
     return None
 
 
