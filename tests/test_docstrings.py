@@ -9,14 +9,14 @@ import pytest
 import torch
 
 import gsparc
-import gsparc.maps
+import gsparc.apps.maps
 
 RNG = np.random.default_rng(0)
 PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.5)]
 ENDS = np.array([[4.0, 4.0, 2.6], [9.0, 9.0, 2.6]])
 POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
 PUBLIC = {name: getattr(gsparc, name) for name in gsparc.__all__}
-MAPS = {name: getattr(gsparc.maps, name) for name in ("map_of", "plan_next")}
+MAPS = {name: getattr(gsparc.apps.maps, name) for name in ("map_of", "plan_next")}
 
 
 @pytest.fixture(scope="module")

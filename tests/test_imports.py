@@ -19,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "processes", "physics", "data", "simulate", "field", "training", "models", "prediction"]
-ROOMS += ["locate", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
+ROOMS += ["locate", "evaluation", "apps.maps", "view", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -33,18 +33,24 @@ ARROWS = {
     "prediction": "data field locate models ops physics processes training",
     "locate": "data models processes training",
     "evaluation": "conf data locate models prediction processes simulate training",
-    "maps": "data evaluation models prediction processes training",
-    "view": "data evaluation maps models ops prediction",
+    "apps.maps": "data evaluation models prediction processes training",
+    "view": "apps.maps data evaluation models ops prediction",
     "callbacks": "data evaluation field training",
-    "commands": "conf data evaluation locate maps models ops prediction simulate training view",
+    "commands": "apps.maps conf data evaluation locate models ops prediction simulate training view",
     "conf": "",
 }
 LARGEST = ("models", "data", "commands")
 GROUPS = ("gsparc.models", "gsparc.datasets")  # of entry points: what plugins bring, by these very words
+
+
+def inside(room: str) -> str:
+    return f"gsparc/{room.replace('.', '/')}"
+
+
 FILES = [
     (room, file)
     for room in ROOMS
-    for file in sorted((ROOT / (room if (ROOT / room).is_dir() else f"gsparc/{room}")).rglob("*.py"))
+    for file in sorted((ROOT / (room if (ROOT / room).is_dir() else inside(room))).rglob("*.py"))
 ]
 
 
@@ -82,7 +88,8 @@ def needed(tree: ast.Module):
 
 def room_of(name: str) -> str | None:
     parts = name.split(".")
-    return parts[1] if parts[0] == "gsparc" and len(parts) > 1 and parts[1] in ROOMS else None
+    room = ".".join(parts[1 : 3 if parts[1:2] == ["apps"] else 2])
+    return room if parts[0] == "gsparc" and room in ROOMS else None
 
 
 @cache
@@ -149,9 +156,9 @@ def _of(name: str, files: dict[str, Path]) -> str | None:
 
 def test_strings_are_followed():
     tree = ast.parse(
-        'import_module("gsparc.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
+        'import_module("gsparc.apps.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
     )
-    assert list(named(tree)) == ["gsparc.maps.making", "gsparc.models.baselines.zero.Zero"]
+    assert list(named(tree)) == ["gsparc.apps.maps.making", "gsparc.models.baselines.zero.Zero"]
     assert ("evaluation", "conf") in arrows(), "the configuration is named in a string alone"
 
 

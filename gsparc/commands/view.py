@@ -9,15 +9,15 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.making import place_of
+from gsparc.apps.maps.pictures import layers
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.walls import read_walls
-from gsparc.maps.field_map import FieldMap
-from gsparc.maps.floor_plan import plan_of
-from gsparc.maps.making import place_of
-from gsparc.maps.pictures import layers
 from gsparc.prediction.timing import peak_memory
 from gsparc.view.building import Building, cloud_colours, cloud_of
 from gsparc.view.ply import write_ply

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.maps.levels import predicted
 from gsparc.data.schema import Site
-from gsparc.maps.levels import predicted
 from gsparc.models.method import HasPaths
 from gsparc.prediction.export import Paths
 from gsparc.prediction.predictor import Predictor

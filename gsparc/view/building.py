@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.levels import MAPPED
+from gsparc.apps.maps.pictures import Legend
 from gsparc.data.blocks import evenly
 from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.levels import MAPPED
-from gsparc.maps.pictures import Legend
 from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
 from gsparc.view.answer import SILENT_DB, Answer

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.maps.pictures import Legend
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import logarithmic, panels
-from gsparc.maps.pictures import Legend
 from gsparc.view.answer import Answer
 from gsparc.view.reasons import Usual
 

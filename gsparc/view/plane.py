@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.maps.area import Grid
-from gsparc.maps.making import levels_at
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.making import levels_at
+from gsparc.apps.maps.pictures import Legend
 from gsparc.prediction.predictor import Predictor
 from gsparc.view.reasons import Usual
 from gsparc.view.scene import Sheet

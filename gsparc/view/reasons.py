@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.pictures import Legend
 from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.view.building import SURFACES
 from gsparc.view.crossed import Obstacles

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.pictures import Legend
 
 EXTENT = 10.0  # of a site in drawn units: near and far planes, controls and camera are then alike everywhere
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.levels import MAPPED
+from gsparc.apps.maps.pictures import Layer, Legend
 from gsparc.data.blocks import evenly
 from gsparc.data.walls import SceneWalls
-from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.levels import MAPPED
-from gsparc.maps.pictures import Layer, Legend
 from gsparc.view.building import VALUES, Building, Sphere, build, start_place
 from gsparc.view.crossed import Obstacles
 from gsparc.view.plane import Plane, refining

@@ -13,9 +13,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from gsparc.apps.maps.pictures import Legend
 from gsparc.data.blocks import evenly
 from gsparc.evaluation.drawing import panels, save
-from gsparc.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.apps.maps import levels
+from gsparc.apps.maps.making import answering
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import aligned, open_files
-from gsparc.maps import levels
-from gsparc.maps.making import answering
 from gsparc.models import loading
 from gsparc.models.reduced import reduced
 from gsparc.prediction.confidence import Trusted, trusted_of

@@ -10,9 +10,9 @@ from campaigns import compose
 from matplotlib.image import imread
 from towns import town_model
 
+from gsparc.apps.maps.making import levels_at
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
-from gsparc.maps.making import levels_at
 from gsparc.models import checkpoint
 from gsparc.view import still
 from gsparc.view.building import SPLATS, Building, build

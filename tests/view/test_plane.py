@@ -8,7 +8,7 @@ import numpy as np
 from campaigns import channels
 from towns import trained
 
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.pictures import Legend
 from gsparc.view.answer import ask
 from gsparc.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
 from gsparc.view.reasons import usual

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.pictures import GREY, Legend
 from gsparc.data.walls import SceneWalls
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.pictures import GREY, Legend
 from gsparc.view.building import Building, build
 from gsparc.view.scene import EXTENT, Frame
 

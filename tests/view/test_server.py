@@ -18,8 +18,8 @@ from campaigns import spectra
 from towns import trained
 
 import gsparc
-from gsparc.maps import map_of
-from gsparc.maps.pictures import layers
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.pictures import layers
 from gsparc.models.reduced import reduced
 from gsparc.prediction.operating_point import Operating
 from gsparc.view.site_view import SiteView, grid_for

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.pictures import Legend
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import PATHS, SPHERE, rays_of
 from gsparc.view.panel import panel_image

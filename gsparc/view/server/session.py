@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from gsparc.maps.area import Grid
-from gsparc.maps.pictures import Legend
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.pictures import Legend
 from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,

@@ -10,11 +10,11 @@ from scipy.spatial import cKDTree
 from towns import town_model
 
 import gsparc
+from gsparc.apps.maps.covariance import ErrorCovariance
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.planning import Tour, plan_next
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
-from gsparc.maps.covariance import ErrorCovariance
-from gsparc.maps.intervals import Evidence
-from gsparc.maps.planning import Tour, plan_next
-from gsparc.maps.promise import Promise
 
 
 @pytest.fixture(scope="module")

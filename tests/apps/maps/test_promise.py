@@ -7,9 +7,9 @@ import pytest
 from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
+from gsparc.apps.maps.promise import PromiseSettings, gather, predict_rows
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.maps.promise import PromiseSettings, gather, predict_rows
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.training.context import FitContext
 

@@ -14,6 +14,12 @@ from matplotlib.transforms import Affine2D
 from scipy.ndimage import distance_transform_edt
 from scipy.ndimage import label as areas_of
 
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.placing import Placing
+from gsparc.apps.maps.planning import Plan
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.links.georeference import Georeference
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import (
@@ -27,12 +33,6 @@ from gsparc.evaluation.from_above import (
     legend_below,
     scale_bar,
 )
-from gsparc.maps.area import Grid
-from gsparc.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.placing import Placing
-from gsparc.maps.planning import Plan
-from gsparc.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
 
 MOST_OVERLAP = 5.0  # stations that the colours end with

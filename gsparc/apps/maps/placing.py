@@ -9,16 +9,16 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.stats import norm
 
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.making import levels_at, map_of
+from gsparc.apps.maps.planning import coarse_grid, walkable_places
+from gsparc.apps.maps.promise import Promise, evidence_of, without
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.maps.area import Grid
-from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import levels_at, map_of
-from gsparc.maps.planning import coarse_grid, walkable_places
-from gsparc.maps.promise import Promise, evidence_of, without
 from gsparc.models.method import Method
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext

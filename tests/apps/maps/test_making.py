@@ -14,10 +14,7 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.data.errors import DataError
-from gsparc.data.own import load_own
-from gsparc.data.splits import Fold
-from gsparc.maps.field_map import (
+from gsparc.apps.maps.field_map import (
     ARRAYS,
     REFUSED,
     FieldMap,
@@ -27,11 +24,14 @@ from gsparc.maps.field_map import (
     server_chance,
     sinr,
 )
-from gsparc.maps.intervals import Evidence
-from gsparc.maps.making import _usual, answering, levels_at, map_of
-from gsparc.maps.pictures import Layer, Legend, layers, named_areas, shades
-from gsparc.maps.promise import Promise
-from gsparc.maps.refining import refined
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.making import _usual, answering, levels_at, map_of
+from gsparc.apps.maps.pictures import Layer, Legend, layers, named_areas, shades
+from gsparc.apps.maps.promise import Promise
+from gsparc.apps.maps.refining import refined
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+from gsparc.data.splits import Fold
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -76,8 +76,8 @@ def test_a_unit_of_maps_changed_their_names_alone(tmp_path):
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):
     whole = map_of(predictor, step_m=5.0)
-    monkeypatch.setattr("gsparc.maps.making.CHUNK", 7)
-    monkeypatch.setattr("gsparc.maps.making.BANDS", 13)
+    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 7)
+    monkeypatch.setattr("gsparc.apps.maps.making.BANDS", 13)
     assert np.allclose(map_of(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
@@ -86,8 +86,8 @@ def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
         time.sleep(0.05)
         return levels_at(*given)
 
-    monkeypatch.setattr("gsparc.maps.making.levels_at", slow)
-    monkeypatch.setattr("gsparc.maps.making.CHUNK", 20)
+    monkeypatch.setattr("gsparc.apps.maps.making.levels_at", slow)
+    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 20)
     began = time.perf_counter()
     signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.2)

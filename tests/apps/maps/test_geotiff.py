@@ -10,11 +10,11 @@ import pytest
 from towns import town_model
 
 import gsparc
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
+from gsparc.apps.maps.planning import plan_next
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
-from gsparc.maps import map_of
-from gsparc.maps.field_map import geotiff_wanted, write_geotiff
-from gsparc.maps.planning import plan_next
 
 ORIGIN = Georeference(47.2, 11.3)
 

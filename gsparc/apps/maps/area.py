@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.path import Path as Outline
 
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import memory
 from gsparc.data.errors import DataError
 from gsparc.data.limits import finite
 from gsparc.data.schema import Site
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.geojson import read_shapes
 from gsparc.prediction.query import usual_heights
 
 CELLS = 20_000  # of a map whose step nobody chose, about

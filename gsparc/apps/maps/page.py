@@ -13,12 +13,12 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.pictures import Layer
 from gsparc.data.blocks import evenly
 from gsparc.data.files import whole_file
 from gsparc.evaluation.from_above import MOST_POINTS
-from gsparc.maps.field_map import FieldMap
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.pictures import Layer
 
 MOST_CELLS = 600  # along a side: the page shows every n-th cell of larger maps
 LEVELS = 65_534  # of a value; 65535 is no value
@@ -36,7 +36,7 @@ def write_page(
 ) -> None:
     """Write an HTML page of layers that needs nothing but itself; `lines` are what a reader must know."""
     every = max(1, -(-max(field.grid.shape) // MOST_CELLS))
-    text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
+    text = files("gsparc.apps.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
     left, right, low, high = field.grid.extent
     few = field.places[evenly(len(field.places), MOST_POINTS)]
     stations = [

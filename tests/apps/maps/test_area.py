@@ -12,12 +12,12 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.area import grid_of
+from gsparc.apps.maps.floor_plan import read_plan
+from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
-from gsparc.maps import map_of
-from gsparc.maps.area import grid_of
-from gsparc.maps.floor_plan import read_plan
-from gsparc.maps.geojson import read_shapes
 
 SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.covariance import ErrorCovariance, before_measuring, unknown_of
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.geojson import Shapes, read_shapes
+from gsparc.apps.maps.making import answering
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
 from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
-from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.covariance import ErrorCovariance, before_measuring, unknown_of
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.geojson import Shapes, read_shapes
-from gsparc.maps.making import answering
-from gsparc.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
 
 TARGETS = 900  # places that the error is averaged over, about
@@ -98,7 +98,7 @@ def plan_next(
 ) -> Plan:
     """Choose places to measure next, as a batch.
 
-    >>> plan = gsparc.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
+    >>> plan = gsparc.apps.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
     >>> plan.places.shape, plan.after_db < plan.before_db
     ((20, 3), True)
 

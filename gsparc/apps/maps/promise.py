@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
+from gsparc.apps.maps.levels import measured, predicted
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
-from gsparc.maps.levels import measured, predicted
 from gsparc.models import checkpoint
 from gsparc.models.method import Method, Reconditions, predictions
 from gsparc.models.per_station import PerStation, for_links, trained_stations
@@ -70,7 +70,7 @@ class Promise:
         return calibrate(self.evidence, share)
 
     def coverage(self, share: float = 0.9) -> Coverage:
-        """See `gsparc.maps.intervals.cross_validated`."""
+        """See `gsparc.apps.maps.intervals.cross_validated`."""
         return cross_validated(self.evidence, share)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:

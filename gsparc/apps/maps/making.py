@@ -11,6 +11,13 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.intervals import Calibration
+from gsparc.apps.maps.levels import MAPPED, cells_of, joint_of, predicted
+from gsparc.apps.maps.promise import Promise, stored_promise
+from gsparc.apps.maps.refining import refined
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.instantiate import suggest
@@ -18,13 +25,6 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
-from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
-from gsparc.maps.floor_plan import FloorPlan
-from gsparc.maps.intervals import Calibration
-from gsparc.maps.levels import MAPPED, cells_of, joint_of, predicted
-from gsparc.maps.promise import Promise, stored_promise
-from gsparc.maps.refining import refined
 from gsparc.models.method import HasJoint, HasPaths
 from gsparc.prediction.predictor import Predictor
 

@@ -8,9 +8,9 @@ import pytest
 from towns import town_model
 
 import gsparc
-from gsparc.maps import map_of
-from gsparc.maps.page import write_page
-from gsparc.maps.pictures import layers
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.page import write_page
+from gsparc.apps.maps.pictures import layers
 
 ActionChains = pytest.importorskip("selenium.webdriver", reason="selenium is not installed").ActionChains
 

@@ -9,10 +9,10 @@ import pytest
 from towns import MASTS, town_file, town_model
 
 import gsparc
+from gsparc.apps.maps.placing import NewStation, new_station_error, place_next
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
-from gsparc.maps.placing import NewStation, new_station_error, place_next
 from gsparc.models import checkpoint
 from gsparc.models.per_station import for_links
 from gsparc.models.registry import method_class

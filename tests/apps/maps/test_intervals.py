@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.maps.intervals import LEAST_ROWS, Evidence, calibrate, covered, cross_validated, distances
+from gsparc.apps.maps.intervals import LEAST_ROWS, Evidence, calibrate, covered, cross_validated, distances
 
 
 def evidence(count=3000, seed=0, heavy=False, stations=1):

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.intervals import Coverage
+from gsparc.apps.maps.promise import Promise, PromiseSettings, gather, stored_promise
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import open_files
-from gsparc.maps.field_map import FieldMap
-from gsparc.maps.intervals import Coverage
-from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
 from gsparc.models import checkpoint
 from gsparc.models.method import Method
 from gsparc.training.context import FitContext

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gsparc.apps.maps.levels import joint_of
+from gsparc.apps.maps.making import levels_at, local_of
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
-from gsparc.maps.levels import joint_of
-from gsparc.maps.making import levels_at, local_of
-from gsparc.maps.promise import Promise
 from gsparc.models.method import HasJoint, HasProcess
 from gsparc.models.powers.settings import fit_powers
 from gsparc.prediction.predictor import Predictor

@@ -12,10 +12,10 @@ from zipfile import BadZipFile
 import numpy as np
 from scipy.stats import norm
 
+from gsparc.apps.maps.area import Grid
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.links.georeference import Georeference
-from gsparc.maps.area import Grid
 
 REFUSED = -1  # of `best_server`
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
