@@ -12,14 +12,14 @@ import numpy as np
 import viser
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.view.answer import Answer, ask
-from gsparc.view.building import PATHS, SPHERE, rays_of
-from gsparc.view.panel import panel_image
-from gsparc.view.plane import sheet
-from gsparc.view.reasons import ENDS, Usual, headline, legend_html
-from gsparc.view.scene import EXTENT, Part, Points, Scene, Sheet
-from gsparc.view.server.draw import draw, draw_scene, first_view, floor
-from gsparc.view.site_view import SiteView, walk
+from gsparc.apps.view.answer import Answer, ask
+from gsparc.apps.view.building import PATHS, SPHERE, rays_of
+from gsparc.apps.view.panel import panel_image
+from gsparc.apps.view.plane import sheet
+from gsparc.apps.view.reasons import ENDS, Usual, headline, legend_html
+from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
+from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.site_view import SiteView, walk
 
 STEPS = 24  # places of the walk, of all stations together
 LEAST = 4  # of each station

@@ -12,14 +12,14 @@ import numpy as np
 from gsparc.apps.maps.area import Grid, grid_of
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Layer, Legend
+from gsparc.apps.view.building import VALUES, Building, Sphere, build, start_place
+from gsparc.apps.view.crossed import Obstacles
+from gsparc.apps.view.plane import Plane, refining
+from gsparc.apps.view.reasons import Surroundings, usual
+from gsparc.apps.view.scene import EXTENT, Points, Scene
+from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
 from gsparc.data.walls import SceneWalls
-from gsparc.view.building import VALUES, Building, Sphere, build, start_place
-from gsparc.view.crossed import Obstacles
-from gsparc.view.plane import Plane, refining
-from gsparc.view.reasons import Surroundings, usual
-from gsparc.view.scene import EXTENT, Points, Scene
-from gsparc.view.viewed import Measured, Viewed
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 import viser
 
+from gsparc.apps.view.latest_job import LatestJobQueue
+from gsparc.apps.view.server.session import Session
+from gsparc.apps.view.site_view import SiteView
 from gsparc.data.errors import DataError
-from gsparc.view.latest_job import LatestJobQueue
-from gsparc.view.server.session import Session
-from gsparc.view.site_view import SiteView
 
 log = logging.getLogger(__name__)
 

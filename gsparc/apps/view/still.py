@@ -14,15 +14,15 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.answer import ask
+from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
+from gsparc.apps.view.panel import RED, draw_answer
+from gsparc.apps.view.plane import thinned
+from gsparc.apps.view.reasons import ENDS, headline
+from gsparc.apps.view.scene import Faces, Lines, Mark, Points
+from gsparc.apps.view.site_view import SiteView
 from gsparc.data.blocks import evenly
 from gsparc.evaluation.drawing import panels, save
-from gsparc.view.answer import ask
-from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
-from gsparc.view.panel import RED, draw_answer
-from gsparc.view.plane import thinned
-from gsparc.view.reasons import ENDS, headline
-from gsparc.view.scene import Faces, Lines, Mark, Points
-from gsparc.view.site_view import SiteView
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
 MOST_DOTS = 3000

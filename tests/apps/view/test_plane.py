@@ -9,11 +9,11 @@ from campaigns import channels
 from towns import trained
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.view.answer import ask
-from gsparc.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
-from gsparc.view.reasons import usual
-from gsparc.view.site_view import grid_for
-from gsparc.view.viewed import open_viewed
+from gsparc.apps.view.answer import ask
+from gsparc.apps.view.plane import Plane, beyond_distance, refining, sheet, thinned, weakest
+from gsparc.apps.view.reasons import usual
+from gsparc.apps.view.site_view import grid_for
+from gsparc.apps.view.viewed import open_viewed
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):

@@ -13,6 +13,10 @@ from scipy.spatial import cKDTree
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.answer import SILENT_DB, Answer
+from gsparc.apps.view.crossed import fans
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
 from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Site
@@ -20,10 +24,6 @@ from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.method import HasGaussians
 from gsparc.ops import Pose
-from gsparc.view.answer import SILENT_DB, Answer
-from gsparc.view.crossed import fans
-from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
-from gsparc.view.viewed import Measured, Viewed
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.pictures import Legend
-from gsparc.view.answer import Answer, ask
-from gsparc.view.building import (
+from gsparc.apps.view.answer import Answer, ask
+from gsparc.apps.view.building import (
     ERRORS,
     GAUSSIANS,
     PATHS,
@@ -28,14 +28,14 @@ from gsparc.view.building import (
     cloud_of,
     rays_of,
 )
-from gsparc.view.latest_job import LatestJobQueue
-from gsparc.view.panel import response_db, spectrum_image, tones_mhz
-from gsparc.view.plane import Plane, beyond_distance, refining, sheet, weakest
-from gsparc.view.ply import ply_bytes
-from gsparc.view.reasons import ENDS, answer_markdown, legend_html, reasons
-from gsparc.view.scene import EXTENT, Points
-from gsparc.view.server.draw import draw, draw_scene, first_view, floor
-from gsparc.view.site_view import SiteView
+from gsparc.apps.view.latest_job import LatestJobQueue
+from gsparc.apps.view.panel import response_db, spectrum_image, tones_mhz
+from gsparc.apps.view.plane import Plane, beyond_distance, refining, sheet, weakest
+from gsparc.apps.view.ply import ply_bytes
+from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
+from gsparc.apps.view.scene import EXTENT, Points
+from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.site_view import SiteView
 
 PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
 FIRST_PLACE, WEAKEST = "first place", "next weak place"

@@ -11,9 +11,9 @@ import numpy as np
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.making import levels_at
 from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.reasons import Usual
+from gsparc.apps.view.scene import Sheet
 from gsparc.prediction.predictor import Predictor
-from gsparc.view.reasons import Usual
-from gsparc.view.scene import Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
 STEP_S = 0.03  # of a step: what a drag waits for [s]

@@ -10,9 +10,9 @@ import pytest
 from campaigns import brief, compose, spectra
 from towns import town_model
 
+from gsparc.apps.view.site_view import SiteView, grid_for
+from gsparc.apps.view.viewed import open_viewed
 from gsparc.commands.train import train
-from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.viewed import open_viewed
 
 
 @cache

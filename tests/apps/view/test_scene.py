@@ -6,9 +6,9 @@ import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.pictures import GREY, Legend
+from gsparc.apps.view.building import Building, build
+from gsparc.apps.view.scene import EXTENT, Frame
 from gsparc.data.walls import SceneWalls
-from gsparc.view.building import Building, build
-from gsparc.view.scene import EXTENT, Frame
 
 
 def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():

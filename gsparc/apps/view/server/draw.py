@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
 
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)

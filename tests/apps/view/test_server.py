@@ -20,10 +20,10 @@ from towns import trained
 import gsparc
 from gsparc.apps.maps import map_of
 from gsparc.apps.maps.pictures import layers
+from gsparc.apps.view.site_view import SiteView, grid_for
+from gsparc.apps.view.viewed import open_viewed
 from gsparc.models.reduced import reduced
 from gsparc.prediction.operating_point import Operating
-from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.viewed import open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -31,10 +31,10 @@ import msgspec  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from gsparc.view.latest_job import LatestJobQueue  # noqa: E402
-from gsparc.view.server.page import page  # noqa: E402
-from gsparc.view.server.serve import Server  # noqa: E402
-from gsparc.view.server.session import CLOUD, Session  # noqa: E402
+from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
+from gsparc.apps.view.server.page import page  # noqa: E402
+from gsparc.apps.view.server.serve import Server  # noqa: E402
+from gsparc.apps.view.server.session import CLOUD, Session  # noqa: E402
 
 
 @pytest.fixture

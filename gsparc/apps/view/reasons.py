@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
-from gsparc.view.building import SURFACES
-from gsparc.view.crossed import Obstacles
-from gsparc.view.scene import Faces, Part
+from gsparc.apps.view.answer import SILENT_DB, Answer, azimuth_elevation
+from gsparc.apps.view.building import SURFACES
+from gsparc.apps.view.crossed import Obstacles
+from gsparc.apps.view.scene import Faces, Part
 
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of

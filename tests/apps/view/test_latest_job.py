@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from gsparc.view.latest_job import LatestJobQueue
+from gsparc.apps.view.latest_job import LatestJobQueue
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsparc.apps.view.ply import FIELDS, Y00, ply_bytes, write_ply
 from gsparc.data.errors import DataError
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.view.ply import FIELDS, Y00, ply_bytes, write_ply
 
 
 def cloud(count: int = 5) -> GaussianCloud:

@@ -11,13 +11,13 @@ from matplotlib.image import imread
 from towns import town_model
 
 from gsparc.apps.maps.making import levels_at
+from gsparc.apps.view import still
+from gsparc.apps.view.building import SPLATS, Building, build
+from gsparc.apps.view.site_view import SiteView, grid_for
+from gsparc.apps.view.viewed import open_viewed
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
-from gsparc.view import still
-from gsparc.view.building import SPLATS, Building, build
-from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.viewed import open_viewed
 
 
 @pytest.fixture

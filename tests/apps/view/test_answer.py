@@ -9,15 +9,15 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from gsparc.apps.view.answer import Answer, Rays, ask, rays
+from gsparc.apps.view.building import MIRROR, WALL, rays_of
+from gsparc.apps.view.crossed import Obstacles
+from gsparc.apps.view.reasons import Surroundings, answer_markdown, headline, legend_html, reasons, usual
+from gsparc.apps.view.scene import Faces
+from gsparc.apps.view.viewed import open_viewed
 from gsparc.data.walls import SceneWalls
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import KEY, Operating
-from gsparc.view.answer import Answer, Rays, ask, rays
-from gsparc.view.building import MIRROR, WALL, rays_of
-from gsparc.view.crossed import Obstacles
-from gsparc.view.reasons import Surroundings, answer_markdown, headline, legend_html, reasons, usual
-from gsparc.view.scene import Faces
-from gsparc.view.viewed import open_viewed
 
 HERE = np.zeros(3)
 NO_BOXES = np.zeros((0, 2, 3))

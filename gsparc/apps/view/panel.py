@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.answer import Answer
+from gsparc.apps.view.reasons import Usual
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import logarithmic, panels
-from gsparc.view.answer import Answer
-from gsparc.view.reasons import Usual
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
 MOST_LINES = 4  # antennas whose responses are drawn

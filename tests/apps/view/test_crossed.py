@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsparc.apps.view.crossed import Obstacles
 from gsparc.data.walls import SceneWalls
-from gsparc.view.crossed import Obstacles
 
 NO_BOXES = np.zeros((0, 2, 3))
 
