@@ -26,9 +26,7 @@ COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
 
 def _composed(line: tuple[str, ...]) -> bool:
     text = " ".join(line)
-    served = (
-        line[0] in ("serve", "view") and "save=" not in text
-    )  # until Ctrl-C (tests/apps/view, test_serve.py)
+    served = line[0] in ("serve", "view") and "save=" not in text  # until Ctrl-C: tests/apps/view
     unfinished = any(word.startswith("ckpt_path") for word in line)  # tests/hard_cases/test_resume.py
     sweep = "experiment=ablation_" in text  # of many trainings
     return (

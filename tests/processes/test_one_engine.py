@@ -58,7 +58,7 @@ def test_each_operation_is_in_its_place_alone():
     assert where["factor"] == {FACTOR}
     assert where["general"] == set(EXCEPTIONS), where["general"] ^ set(EXCEPTIONS)
     # The probability of a silent row alone, nothing is propagated.
-    silence = {"gsparc/locate/likelihood.py", "gsparc/data/links/strongest.py"}
+    silence = {"gsparc/apps/locate/likelihood.py", "gsparc/data/links/strongest.py"}
     silence.add("gsparc/models/powers/together/network.py")
     assert where["expectation propagation"] == {"gsparc/processes/censored.py"} | silence
     assert defined["left_out_group"] == ["gsparc/processes/left_out.py"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.locate.cells import MARGIN_M, cover, cover_floors, floors
-from gsparc.locate.posterior import Posterior
+from gsparc.apps.locate.cells import MARGIN_M, cover, cover_floors, floors
+from gsparc.apps.locate.posterior import Posterior
 
 PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
 

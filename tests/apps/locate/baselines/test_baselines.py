@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from releases import real
 
-from gsparc.locate.baselines.methods import kernel, least_error, neighbours
-from gsparc.locate.baselines.network import network
-from gsparc.locate.baselines.table import BASELINES
-from gsparc.locate.fingerprints.rows import parted, read_fingerprints
+from gsparc.apps.locate.baselines.methods import kernel, least_error, neighbours
+from gsparc.apps.locate.baselines.network import network
+from gsparc.apps.locate.baselines.table import BASELINES
+from gsparc.data.datasets.fingerprints import parted, read_fingerprints
 
 FITS = BASELINES | {"mlp": partial(network, budget_s=3.0)}
 

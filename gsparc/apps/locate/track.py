@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.locate.likelihood import Misfit
-from gsparc.locate.locator import Located
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.search import Looked
-from gsparc.locate.snapshots import Snapshots
+from gsparc.apps.locate.likelihood import Misfit
+from gsparc.apps.locate.locator import Located
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.apps.locate.search import Looked
+from gsparc.apps.locate.snapshots import Snapshots
 
 KEPT = 500  # cells of a snapshot, the heaviest
 ANYWHERE = 0.01  # probability of a step to a place that has nothing to do with the last

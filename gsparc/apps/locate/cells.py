@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.locate.shared_kernel import STOREY_M
+from gsparc.apps.locate.shared_kernel import STOREY_M
 
 THIN = 0.02  # of the longest side: what is shorter is no axis
 REACH = 3.0  # times the median distance between neighbouring trained places, within which one can stand

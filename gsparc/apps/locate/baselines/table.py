@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from gsparc.locate.baselines.methods import Locator, kernel, neighbours, process
-from gsparc.locate.baselines.network import network
-from gsparc.locate.snapshots import Snapshots
+from gsparc.apps.locate.baselines.methods import Locator, kernel, neighbours, process
+from gsparc.apps.locate.baselines.network import network
+from gsparc.apps.locate.snapshots import Snapshots
 
 BASELINES: dict[str, Callable[[np.ndarray, np.ndarray], Locator]] = {
     "nearest": partial(neighbours, counts=(1,)),

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.apps.locate.snapshots import compared
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
-from gsparc.locate.snapshots import compared
 from gsparc.models.method import Method, suited_threads
 
 CHUNK = 512  # places that are asked about at a time

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from access_points import invented, rows_of, walks
 
-from gsparc.locate.fingerprints.locator import FingerprintLocator, as_snapshots, place, trusted
-from gsparc.locate.fingerprints.rows import Fingerprints
-from gsparc.locate.posterior import Posterior
+from gsparc.apps.locate.fingerprints.locator import FingerprintLocator, as_snapshots, place, trusted
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.data.datasets.fingerprints import Fingerprints
 
 
 def errors(found, rows: Fingerprints) -> np.ndarray:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.locate import calibration
-from gsparc.locate.calibration import calibrated
-from gsparc.locate.cells import cover
-from gsparc.locate.likelihood import Trust, of_levels
-from gsparc.locate.search import Looked
+from gsparc.apps.locate import calibration
+from gsparc.apps.locate.calibration import calibrated
+from gsparc.apps.locate.cells import cover
+from gsparc.apps.locate.likelihood import Trust, of_levels
+from gsparc.apps.locate.search import Looked
 
 STATIONS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
 CORNERS = np.array([[0.0, 0, 0], [10.0, 10, 0]])

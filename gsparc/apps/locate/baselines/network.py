@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gsparc.locate.baselines.methods import Locator, mean_place, without_gaps
+from gsparc.apps.locate.baselines.methods import Locator, mean_place, without_gaps
 from gsparc.processes.neighbourhood import covering
 
 BATCH, RATE = 64, 1e-3

@@ -10,16 +10,16 @@ from typing import Self
 import numpy as np
 import torch
 
-from gsparc.locate.calibration import calibrated
-from gsparc.locate.cells import Cells, cover_floors
-from gsparc.locate.fingerprints.field import FingerprintField, Levels, learn, misfit
-from gsparc.locate.fingerprints.rows import Fingerprints, How, parted
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.locator import HELD_OUT, Located
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.search import Looked
-from gsparc.locate.snapshots import Snapshots
-from gsparc.locate.track import as_looked, smoothed, speed
+from gsparc.apps.locate.calibration import calibrated
+from gsparc.apps.locate.cells import Cells, cover_floors
+from gsparc.apps.locate.fingerprints.field import FingerprintField, Levels, learn, misfit
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.locator import HELD_OUT, Located
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.apps.locate.search import Looked
+from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.apps.locate.track import as_looked, smoothed, speed
+from gsparc.data.datasets.fingerprints import Fingerprints, How, parted
 
 ROWS = 64  # at a time
 PLAIN = Trust(1.0, 1.0, 100.0)  # the field's own variances, and nothing else

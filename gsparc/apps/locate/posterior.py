@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
-from gsparc.locate.cells import Cells
+from gsparc.apps.locate.cells import Cells
 
 MODE = 0.05  # of the mass, that a further mode has at least
 BLURRED = 0.999  # of the mass: cells beyond it stay as they are

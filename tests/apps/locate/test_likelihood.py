@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.locate.likelihood import Trust, of_channels, of_levels, of_spectra
+from gsparc.apps.locate.likelihood import Trust, of_channels, of_levels, of_spectra
 
 RNG = np.random.default_rng(0)
 

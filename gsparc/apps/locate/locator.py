@@ -12,16 +12,16 @@ from typing import Any, Self
 import numpy as np
 import torch
 
+from gsparc.apps.locate.calibration import calibrated, levelled
+from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.posterior import Posterior, likeliest
+from gsparc.apps.locate.search import Looked, Unknown, misfit
+from gsparc.apps.locate.site_field import Moments, SiteField
+from gsparc.apps.locate.snapshots import Snapshots, snapshots
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.locate.calibration import calibrated, levelled
-from gsparc.locate.cells import Cells, cover  # noqa: F401 (a predictor covers its site with it)
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.posterior import Posterior, likeliest
-from gsparc.locate.search import Looked, Unknown, misfit
-from gsparc.locate.site_field import Moments, SiteField
-from gsparc.locate.snapshots import Snapshots, snapshots
 from gsparc.models.method import Method
 from gsparc.models.per_station import for_links
 from gsparc.training.context import FitContext

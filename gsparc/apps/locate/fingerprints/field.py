@@ -23,8 +23,8 @@ from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from gsparc.locate.likelihood import Misfit, of_levels
-from gsparc.locate.shared_kernel import settings, stretched
+from gsparc.apps.locate.likelihood import Misfit, of_levels
+from gsparc.apps.locate.shared_kernel import settings, stretched
 from gsparc.processes.nearest import Nearest, Values, given
 
 BELOW_DB = 1.0  # of the faintest level, that the base lies

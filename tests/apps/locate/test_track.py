@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.locate.cells import Cells, cover
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.track import ANYWHERE, as_looked, smoothed, speed
+from gsparc.apps.locate.cells import Cells, cover
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.apps.locate.track import ANYWHERE, as_looked, smoothed, speed
 
 
 def hall() -> Cells:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from releases import real
 
+from gsparc.data.datasets.fingerprints import Fingerprints, parted, read_fingerprints
 from gsparc.data.errors import DataError
-from gsparc.locate.fingerprints.rows import Fingerprints, parted, read_fingerprints
 
 NAN = np.nan
 

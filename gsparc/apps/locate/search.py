@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsparc.locate import likelihood
-from gsparc.locate.cells import Cells
-from gsparc.locate.likelihood import Misfit, Trust
-from gsparc.locate.posterior import Posterior
-from gsparc.locate.site_field import Moments
-from gsparc.locate.snapshots import Snapshots
+from gsparc.apps.locate import likelihood
+from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.likelihood import Misfit, Trust
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.apps.locate.site_field import Moments
+from gsparc.apps.locate.snapshots import Snapshots
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Looked:
 
 
 def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
-    """Of snapshots at places; see `gsparc.locate.likelihood`."""
+    """Of snapshots at places; see `gsparc.apps.locate.likelihood`."""
     if heard.kind == "spectrum":
         return likelihood.of_spectra(heard.values, there.mean, there.variance)
     if heard.kind == "csi":

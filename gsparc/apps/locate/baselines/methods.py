@@ -17,7 +17,7 @@ from sklearn.metrics import pairwise_distances
 from sklearn.model_selection import GroupKFold
 from sklearn.neighbors import KNeighborsRegressor
 
-from gsparc.locate.shared_kernel import settings, stretched
+from gsparc.apps.locate.shared_kernel import settings, stretched
 from gsparc.processes.nearest import Values, given
 
 Locator = Callable[[np.ndarray], np.ndarray]  # features to places

@@ -17,6 +17,16 @@ from matplotlib.patches import Rectangle
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from gsparc.apps.locate import locator as locating
+from gsparc.apps.locate.baselines.table import located_by
+from gsparc.apps.locate.cells import Cells, cover
+from gsparc.apps.locate.fingerprints.locator import SHARED, FingerprintLocator, as_snapshots, trusted
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.locator import Located, Locator
+from gsparc.apps.locate.search import Unknown
+from gsparc.apps.locate.snapshots import Snapshots, snapshots
+from gsparc.apps.locate.track import followed
+from gsparc.data.datasets.fingerprints import parted, read_fingerprints
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, SHARE
 from gsparc.data.own import interpreted
@@ -26,16 +36,6 @@ from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
-from gsparc.locate import locator as locating
-from gsparc.locate.baselines.table import located_by
-from gsparc.locate.cells import Cells, cover
-from gsparc.locate.fingerprints.locator import SHARED, FingerprintLocator, as_snapshots, trusted
-from gsparc.locate.fingerprints.rows import parted, read_fingerprints
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.locator import Located, Locator
-from gsparc.locate.search import Unknown
-from gsparc.locate.snapshots import Snapshots, snapshots
-from gsparc.locate.track import followed
 from gsparc.models import checkpoint
 
 log = logging.getLogger(__name__)

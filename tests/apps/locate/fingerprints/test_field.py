@@ -11,8 +11,8 @@ from access_points import invented
 from releases import real
 from scipy.stats import multivariate_normal
 
-from gsparc.locate.fingerprints.field import HEARING, FingerprintField, Levels, learn, misfit
-from gsparc.locate.fingerprints.rows import parted, read_fingerprints
+from gsparc.apps.locate.fingerprints.field import HEARING, FingerprintField, Levels, learn, misfit
+from gsparc.data.datasets.fingerprints import parted, read_fingerprints
 
 NAN = float("nan")
 

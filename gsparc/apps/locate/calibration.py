@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.search import Looked
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.search import Looked
 
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
