@@ -17,7 +17,7 @@ EXCEPTIONS = {  # who solves a system for itself, and why
     "gsparc/models/baselines/ridge.py": "a baseline: complex ridge regression, no covariance of places",
     "gsparc/prediction/export.py": "a baseline's filter over tones, no covariance of places",
     "gsparc/prediction/along/taps.py": "taps of a delay line by least squares, no covariance of places",
-    "gsparc/evaluation/link/pusch.py": "the receiver's filter of a link, no covariance of places",
+    "gsparc/apps/link/pusch.py": "the receiver's filter of a link, no covariance of places",
     "gsparc/data/datasets/powder.py": "a map from degrees to metres by least squares",
     "gsparc/data/checks/level_steps.py": "a mean law by least squares",
     "gsparc/data/checks/conventions.py": "the lobe about a strongest direction by least squares",

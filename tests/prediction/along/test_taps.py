@@ -166,8 +166,8 @@ def test_a_link_over_exported_taps_is_the_link_study(tmp_path):
     sionna = pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
     from sionna.phy.channel import cir_to_ofdm_channel
 
-    from gsparc.evaluation.link.adaptation import Band
-    from gsparc.evaluation.link.pusch import Pusch
+    from gsparc.apps.link.adaptation import Band
+    from gsparc.apps.link.pusch import Pusch
 
     tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
     ray, way = Rays(tones, True), drive()

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.apps.link.adaptation import Rates
 from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
-from gsparc.evaluation.link.adaptation import Rates
 from gsparc.prediction.risk_threshold import binomial_interval
 
 STYLES = {

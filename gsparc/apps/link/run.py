@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.calibration import accept
-from gsparc.evaluation.link.adaptation import Rates, Rule
-from gsparc.evaluation.link.channels import channels, on_band
-from gsparc.evaluation.link.pusch import RECEIVERS, Pusch, frequency_correlation
-from gsparc.evaluation.link.study import (
+from gsparc.apps.link.adaptation import Rates, Rule
+from gsparc.apps.link.channels import channels, on_band
+from gsparc.apps.link.pusch import RECEIVERS, Pusch, frequency_correlation
+from gsparc.apps.link.study import (
     acceptance,
     adapt,
     beam_facts,
@@ -24,6 +23,7 @@ from gsparc.evaluation.link.study import (
     tradeoff,
     transmit,
 )
+from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.prediction.risk_threshold import Guarantee

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.apps.link.adaptation import Band
 from gsparc.data.datasets.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation.link.adaptation import Band
 from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths

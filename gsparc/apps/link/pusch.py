@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gsparc.evaluation.link.adaptation import Band
+from gsparc.apps.link.adaptation import Band
 
 Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

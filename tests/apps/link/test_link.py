@@ -15,11 +15,11 @@ from cities import city, fold
 from doors import knock
 
 from gsparc import load
+from gsparc.apps.link.adaptation import Adaptation, Band, Rates
+from gsparc.apps.link.channels import truth
+from gsparc.apps.link.pusch import Pusch, frequency_correlation
+from gsparc.apps.link.study import beam_facts, crossing, gain, loss_db, rate_facts, transmit
 from gsparc.commands.listing import COMMANDS
-from gsparc.evaluation.link.adaptation import Adaptation, Band, Rates
-from gsparc.evaluation.link.channels import truth
-from gsparc.evaluation.link.pusch import Pusch, frequency_correlation
-from gsparc.evaluation.link.study import beam_facts, crossing, gain, loss_db, rate_facts, transmit
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
