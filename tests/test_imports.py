@@ -19,7 +19,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "processes", "physics", "data", "simulate", "field", "training", "models", "prediction"]
-ROOMS += ["evaluation", "apps.locate", "apps.link", "apps.maps", "apps.view", "commands", "callbacks", "conf"]
+ROOMS += [
+    "evaluation",
+    "apps.export",
+    "apps.link",
+    "apps.locate",
+    "apps.maps",
+    "apps.view",
+    "commands",
+    "callbacks",
+    "conf",
+]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -34,10 +44,11 @@ ARROWS = {
     "apps.locate": "data evaluation models prediction processes training",
     "evaluation": "conf data models prediction processes simulate training",
     "apps.maps": "data evaluation models prediction processes training",
+    "apps.export": "data field models ops physics prediction processes training",
     "apps.link": "data evaluation models prediction simulate",
     "apps.view": "apps.maps data evaluation models ops prediction",
     "callbacks": "data evaluation field training",
-    "commands": "apps.link apps.locate apps.maps apps.view conf "
+    "commands": "apps.export apps.link apps.locate apps.maps apps.view conf "
     "data evaluation models ops prediction simulate training",
     "conf": "",
 }

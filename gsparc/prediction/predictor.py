@@ -26,7 +26,7 @@ from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
-    from gsparc.prediction.export import Paths
+    from gsparc.prediction.channels import Paths
     from gsparc.prediction.operating_point import Operating
 
 
@@ -278,29 +278,29 @@ class Predictor:
             return self._ask("csi", tx, rx, grad)
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
-        from gsparc.prediction import export
+        from gsparc.prediction import channels
 
         if uplink is not None:
-            channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
-            answer = export.on_grid(channel, self.site, None, symbols)
+            channel = channels.uplink_channels(self.method, self.site, uplink, frequency_hz)
+            answer = channels.on_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
         channel = channel[None] if channel.ndim == 2 else channel
-        answer = export.on_grid(channel, self.site, frequency_hz, symbols)
+        answer = channels.on_grid(channel, self.site, frequency_hz, symbols)
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
-        positions; see `gsparc.prediction.export`.
+        positions; see `gsparc.prediction.channels`.
 
         Raises:
             ValueError: the model's channels are not made of paths.
         """
-        from gsparc.prediction import export
+        from gsparc.prediction import channels
 
         if uplink is not None:
-            return export.uplink_paths(self.method, self.site, uplink)
-        return export.placed_paths(self._whole, self.site, self._query(tx, rx).query)
+            return channels.uplink_paths(self.method, self.site, uplink)
+        return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Received power (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
@@ -350,9 +350,9 @@ class Predictor:
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
         """Confidences (B,), whether one was wanted, and whether torch was given."""
         if uplink is not None:
-            from gsparc.prediction import export
+            from gsparc.prediction import channels
 
-            sure = self._confidence(export.judged(self.method, self.site, uplink), None)
+            sure = self._confidence(channels.judged(self.method, self.site, uplink), None)
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self._query(tx, rx)

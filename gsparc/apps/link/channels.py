@@ -17,8 +17,8 @@ from gsparc.data.splits import Fold
 from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
+from gsparc.prediction.channels import interpolated
 from gsparc.prediction.confidence import Evidence, judged, rivals
-from gsparc.prediction.export import interpolated
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World

@@ -25,7 +25,7 @@ from gsparc.apps.link.study import (
 )
 from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import Opened
-from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.prediction.risk_threshold import Guarantee
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.apps.maps.levels import predicted
 from gsparc.data.schema import Site
 from gsparc.models.method import HasPaths
-from gsparc.prediction.export import Paths
+from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown

@@ -23,7 +23,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
-from gsparc.prediction.export import centred, interpolated, resource_grid
+from gsparc.prediction.channels import centred, interpolated, resource_grid
 from gsparc.prediction.risk_threshold import binomial_interval
 from gsparc.training.context import FitContext
 

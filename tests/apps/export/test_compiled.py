@@ -19,18 +19,18 @@ import pytest
 import torch
 
 import gsparc
+from gsparc.apps.export.compiled import make
+from gsparc.apps.export.compiled.blob import CHECKED, HEAD, Form, packed
 from gsparc.commands import export
 from gsparc.commands.train import train
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.query import Query
 from gsparc.models import checkpoint
 from gsparc.models.terms import EffectSettings
-from gsparc.prediction.compiled import make
-from gsparc.prediction.compiled.blob import CHECKED, HEAD, Form, packed
 from gsparc.processes import powers
 from gsparc.processes.neighbourhood import Neighbourhood
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SOURCES, EXAMPLES = ROOT / "ops" / "csrc" / "field", ROOT / "examples" / "c-library"
 LIGHT, PLACES, SCALE = 299_792_458.0, int(os.environ.get("GSPARC_PLACES", "400")), 1e-5
 FUZZ_S = int(os.environ.get("GSPARC_FUZZ_S", "10"))

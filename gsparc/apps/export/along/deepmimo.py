@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.apps.export.along.taps import located_paths
 from gsparc.data.schema import LIGHT
-from gsparc.prediction.along.taps import located_paths
 from gsparc.prediction.predictor import Predictor
 
 PATHS = 25  # that a DeepMIMO scenario has at most

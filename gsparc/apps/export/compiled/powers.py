@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gsparc.prediction.compiled.blob import Form, packed
+from gsparc.apps.export.compiled.blob import Form, packed
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import JITTER, Nearest
 from gsparc.processes.neighbourhood import Neighbourhood

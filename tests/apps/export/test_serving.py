@@ -27,11 +27,11 @@ from gsparc.models import checkpoint
 
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
-from gsparc.prediction.serving import RAW, Limits, Server, application
+from gsparc.apps.export.serving import RAW, Limits, Server, application
 
 TX = np.array([3.0, 2, 2])
 HOSTILE, HOSTILE_S = (
-    Path(__file__).parents[1] / "helpers" / "hostile.py",
+    Path(__file__).parents[2] / "helpers" / "hostile.py",
     int(os.environ.get("GSPARC_HOSTILE_S", "15")),
 )
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from gsparc.data.schema import LIGHT
-from gsparc.prediction.export import Paths
+from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs

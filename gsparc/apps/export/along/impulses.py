@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.apps.export.along.taps import Trajectory, fitted
 from gsparc.data.raw import Raw, write_raw
-from gsparc.prediction.along.taps import Trajectory, fitted
 from gsparc.prediction.predictor import Predictor
 
 

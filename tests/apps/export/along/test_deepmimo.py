@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from gsparc.apps.export.along import deepmimo
 from gsparc.data.schema import LIGHT
-from gsparc.prediction.along import deepmimo
-from gsparc.prediction.export import Paths
+from gsparc.prediction.channels import Paths
 
 CARRIER = 3.5e9
 STILL = np.array([100.0, 50, 8])

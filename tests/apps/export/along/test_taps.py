@@ -8,12 +8,12 @@ import torch
 from campaigns import compose
 
 import gsparc
+from gsparc.apps.export.along.taps import Trajectory, fitted
 from gsparc.commands import export
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT
 from gsparc.models import checkpoint
-from gsparc.prediction.along.taps import Trajectory, fitted
-from gsparc.prediction.export import Paths
+from gsparc.prediction.channels import Paths
 
 CARRIER = 3.5e9
 
@@ -128,7 +128,7 @@ def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch)
 
 def played(file, line, taps, end="rx_position"):
     """Sionna's channel model of a line of taps."""
-    from gsparc.prediction.along.link import TrajectoryChannel
+    from gsparc.apps.export.along.link import TrajectoryChannel
 
     delay = (line.first + np.arange(taps)) / line.rate_hz
     arrays = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay}

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gsparc.apps.export.compiled.blob import Form
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.field.model import GaussianModel
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.prediction.compiled.blob import Form
 from gsparc.processes.features import parts_of
 from gsparc.processes.posterior import Exact
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gsparc.apps.export.compiled.blob import Form
 from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import evenly_spaced
-from gsparc.prediction.compiled.blob import Form
 
 LANES = 16
 BEYOND = 1e6  # [m], a place that is near none

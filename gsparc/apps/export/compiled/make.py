@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.apps.export.compiled.blob import Form
+from gsparc.apps.export.compiled.channels import sources_form
+from gsparc.apps.export.compiled.powers import powers_form
+from gsparc.apps.export.compiled.spectra import array_form, process_form, view_form
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
@@ -22,10 +26,6 @@ from gsparc.models.planned_field import PlannedField
 from gsparc.models.powers.field import PowerField
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
-from gsparc.prediction.compiled.blob import Form
-from gsparc.prediction.compiled.channels import sources_form
-from gsparc.prediction.compiled.powers import powers_form
-from gsparc.prediction.compiled.spectra import array_form, process_form, view_form
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
