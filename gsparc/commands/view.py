@@ -40,7 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     viewed, site = view.viewed, view.viewed.site
     facts = {
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
-        "ckpt": str(config.ckpt), "view/operating_points": len(viewed.ways), **peak_memory(),
+        "ckpt": str(config.ckpt), **peak_memory(),
     }  # fmt: skip
     return finish(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
 

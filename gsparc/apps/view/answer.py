@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +24,6 @@ class Answer:
 
     Attributes:
         ends: world places (3,) [m] that were given, and that of the static end where it is known.
-        query_ms: of the mean alone at the chosen operating point [ms].
         level_db, spread_db: received power and its deviation [dB]; None of spectra.
         confidence: in [0, 1]; None where the method has none.
         spectrum: (H, W) in [0, 1]; None of other kinds.
@@ -37,7 +34,6 @@ class Answer:
     """
 
     ends: Mapping[str, np.ndarray]
-    query_ms: float
     level_db: float | None = None
     spread_db: float | None = None
     confidence: float | None = None
@@ -69,11 +65,8 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
         ValueError: a place that cannot be.
     """
     site, kind = predictor.site, predictor.site.kind
-    start = time.perf_counter()
-    mean = np.asarray(getattr(predictor, kind)(**ends))
-    query_ms = (time.perf_counter() - start) * 1e3
-    query: dict[str, Any] = {end: np.atleast_2d(place) for end, place in ends.items()}
-    prediction = predictor.linear(**query)
+    prediction = predictor.linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
+    mean = prediction.mean[0].numpy()
     still: dict[str, np.ndarray] = {}
     if site.static_end is not None and site.static_position is not None:
         still[site.static_end] = site.static_position + site.origin
@@ -81,7 +74,7 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     if kind != "spectrum":
         level, spread = (float(value[0]) for value in predicted(prediction, kind))
     return Answer(
-        {**still, **ends}, query_ms, level, spread,
+        {**still, **ends}, level, spread,
         None if prediction.confidence is None else float(prediction.confidence[0]),
         mean if kind == "spectrum" else None, mean if kind == "csi" else None,
         _strongest(mean, site) if kind == "spectrum" else None, _rays(predictor, ends),

@@ -20,12 +20,6 @@ MOST_DOTS = 1500  # measured levels that are drawn
 FLOOR_DB = -60.0  # below the largest entry of a channel, where its response ends
 
 
-def spectrum_image(spectrum: np.ndarray) -> np.ndarray:
-    """A spectrum (H, W) as (h, w, 3) uint8, at least 360 wide: azimuth to the right, elevation upwards."""
-    times = max(1, -(-360 // spectrum.shape[1]))
-    return np.repeat(np.repeat(SPECTRUM.of(spectrum[::-1]), times, axis=0), times, axis=1)
-
-
 def response_db(response: np.ndarray) -> np.ndarray:
     """Lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K); the mean (A,) of one tone."""
     power = np.abs(response).astype(np.float64) ** 2

@@ -1,4 +1,4 @@
-"""A checkpoint as a viewer needs it: whom to ask, at which operating points, and what was measured."""
+"""A checkpoint as a viewer needs it: whom to ask, and what was measured."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import aligned, open_files
 from gsparc.models import loading
-from gsparc.models.reduced import reduced
-from gsparc.prediction.confidence import Trusted, trusted_of
-from gsparc.prediction.operating_point import stored_points
+from gsparc.prediction.confidence import trusted_of
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -55,8 +53,7 @@ class Viewed:
 
     Attributes:
         name: of the checkpoint.
-        ways: one per operating point, the fastest first, as trained last; the `point` of that has no settings
-            and is None where `gsparc tradeoff` measured nothing.
+        predictor: as trained.
         data: in the model's coordinates and units; None where they are gone.
         test: (n,) rows that were not learned from.
         stations: that it answers for; one, None, where there is one static end or none.
@@ -65,17 +62,12 @@ class Viewed:
     """
 
     name: str
-    ways: tuple[Predictor, ...]
+    predictor: Predictor
     data: Measurements | None
     test: np.ndarray
     stations: tuple[str | None, ...]
     notes: tuple[str, ...] = ()
     unit: str = "dB"
-
-    @property
-    def predictor(self) -> Predictor:
-        """As trained."""
-        return self.ways[-1]
 
     @property
     def site(self) -> Site:
@@ -87,9 +79,9 @@ class Viewed:
         """Ends that can be dragged."""
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
-    def predictor_of(self, station: str | None, way: int = -1) -> Predictor:
-        """Of a station, at one of the operating points."""
-        return self.ways[way] if station is None else self.ways[way].at(station)
+    def predictor_of(self, station: str | None) -> Predictor:
+        """Of a station."""
+        return self.predictor if station is None else self.predictor.at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
         """World place (3,) [m] of the static end; None where it is unknown or moves."""
@@ -191,17 +183,9 @@ def open_viewed(
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     site, trusted = stored.site.in_levels(unit), trusted_of(stored.extra)
     data = None if data is None else aligned(data, site)
-    points, measured = stored_points(stored.extra)
-    ways = []
-    for point in sorted((point for point in points if point.settings), key=lambda point: point.p50_ms):
-        lean, whole, confidence = reduced(method, point.settings, measured), method, trusted
-        if point.settings.get("confidence") is False:
-            whole, confidence = lean, Trusted()
-        ways.append(Predictor(lean, site, whole, point, confidence, None, stored.extra))
-    complete = min((one for one in points if not one.settings), key=lambda one: one.p50_ms, default=None)
-    ways.append(Predictor(method, site, point=complete, trusted=trusted, extra=stored.extra))
-    names, missing = answering(ways[-1], None if station is None else [station], key="station")
+    predictor = Predictor(method, site, trusted=trusted, extra=stored.extra)
+    names, missing = answering(predictor, None if station is None else [station], key="station")
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)
-    return Viewed(str(path), tuple(ways), data, test, stations, tuple(notes), site.level_unit)
+    return Viewed(str(path), predictor, data, test, stations, tuple(notes), site.level_unit)

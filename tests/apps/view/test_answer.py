@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +13,7 @@ from gsparc.apps.view.building import MIRROR, WALL, rays_of
 from gsparc.apps.view.crossed import Obstacles
 from gsparc.apps.view.reasons import Surroundings, answer_markdown, headline, legend_html, reasons, usual
 from gsparc.apps.view.scene import Faces
-from gsparc.apps.view.viewed import open_viewed
 from gsparc.data.walls import SceneWalls
-from gsparc.models import checkpoint
-from gsparc.prediction.operating_point import KEY, Operating
 
 HERE = np.zeros(3)
 NO_BOXES = np.zeros((0, 2, 3))
@@ -48,7 +44,7 @@ def test_a_weak_place_behind_something_is_explained():
     places = rng.uniform(-20, 20, (200, 3))
     level = -30 - 20 * np.log10(np.linalg.norm(places, axis=1)) + rng.normal(size=200)
     here = np.array([10.0, 0, 0])
-    answer = Answer({"rx": here, "tx": -here}, 1.0, level_db=-75.0)
+    answer = Answer({"rx": here, "tx": -here}, level_db=-75.0)
     about = Surroundings(usual(places, level, np.zeros(3)), level, unit="dBm")
     said = " | ".join(reasons(answer, "rx", about))
     assert "20 m from the other end" in said and "(weaker" in said and "weaker than 100%" in said
@@ -66,28 +62,28 @@ def test_where_both_ends_moved_the_nearest_measurement_is_one_of_both():
     """A receiver that was measured with a transmitter far away was said to be measured here."""
     rx, tx = np.zeros((2, 3)), np.array([[1.0, 0, 0], [9, 0, 0]])
     about = Surroundings(usual(rx, np.zeros(2), tx))
-    said = reasons(Answer({"rx": np.zeros(3), "tx": np.array([3.0, 0, 0])}, 1.0), "rx", about)
+    said = reasons(Answer({"rx": np.zeros(3), "tx": np.array([3.0, 0, 0])}), "rx", about)
     assert said[-1] == "nearest measurement: transmitter 2 m and receiver 0 m away"
-    assert reasons(Answer({"rx": np.zeros(3), "tx": tx[1]}, 1.0), "rx", about)[-1] == "measured here"
+    assert reasons(Answer({"rx": np.zeros(3), "tx": tx[1]}), "rx", about)[-1] == "measured here"
 
 
 def test_a_weak_spectrum_is_said_to_be_one():
-    answer = Answer({"rx": HERE}, 1.0, spectrum=np.full((2, 2), 0.2))
+    answer = Answer({"rx": HERE}, spectrum=np.full((2, 2), 0.2))
     said = reasons(answer, "rx", Surroundings(values=np.array([0.1, 0.3, 0.4, np.nan])))
     assert said == ["mean of the spectrum 0.200, lower than 67% of what was measured"]
 
 
 def test_a_fade_is_said_to_be_one():
     paths = Rays(np.array([-40.0, -40.5]), np.array([10.0, 20]), None)
-    said = " | ".join(reasons(Answer({"rx": HERE}, 1.0, level_db=-60.0, paths=paths), "rx", Surroundings()))
+    said = " | ".join(reasons(Answer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", Surroundings()))
     assert "they cancel each other: 22.8 dB less than their powers" in said
-    said = " | ".join(reasons(Answer({"rx": HERE}, 1.0, level_db=-37.5, paths=paths), "rx", Surroundings()))
+    said = " | ".join(reasons(Answer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", Surroundings()))
     assert "their powers" not in said
 
 
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
     spectrum = ask(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
-    assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None and spectrum.query_ms > 0
+    assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None
     assert set(spectrum.ends) == {"tx", "rx"}
     grid = spectrum_view.viewed.site.grid  # it said -29 degrees of the world over a peak at 58
     row, column = np.unravel_index(spectrum.spectrum.argmax(), spectrum.spectrum.shape)
@@ -117,24 +113,14 @@ def test_a_path_that_two_searches_found_is_one_path():
 def test_rays_are_as_long_as_their_delays():
     towards = np.array([[1.0, 0, 0], [0, 1, 0]])
     rays = Rays(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
-    lines, ends = rays_of(Answer({"rx": np.ones(3)}, 1.0, paths=rays), 100.0)
+    lines, ends = rays_of(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)
 
 
-def test_an_operating_point_without_confidence_showed_that_of_the_whole_model(spectrum_view, tmp_path):
-    file = tmp_path / "model.ckpt"
-    shutil.copy(spectrum_view.viewed.name, file)
-    point = Operating("no confidence", {"confidence": False}, 1, 0.0, ("psnr_db", 20.0), 0.5)
-    checkpoint.amend(file, {KEY: {"points": [asdict(point)], "measured": {}}})
-    lean, trained = open_viewed(file).ways
-    place = {end: np.full(3, 0.5) for end in spectrum_view.viewed.moving}
-    assert ask(lean, place).confidence is None and ask(trained, place).confidence is not None
-
-
 def test_nought_has_no_sign():
-    said = answer_markdown(Answer({"rx": np.array([-0.001, 0.0, -1.0])}, 1.0, level_db=-50.0), ["rx"], [])
+    said = answer_markdown(Answer({"rx": np.array([-0.001, 0.0, -1.0])}, level_db=-50.0), ["rx"], [])
     assert "receiver at 0.00, 0.00, -1.00 m" in said
 
 

@@ -27,8 +27,8 @@ PAUSE_S = 0.6  # at each
 UP = 0.17  # widths that the camera looks above the middle, for the panel that stands behind
 LIMITS = (
     "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
-    "plays {steps} recorded places of the {end}{stations}. To drag it anywhere, to change the operating "
-    "point or to lift the plane: gsparc view ckpt=FILE."
+    "plays {steps} recorded places of the {end}{stations}. To drag it anywhere or to lift the plane: "
+    "gsparc view ckpt=FILE."
 )
 
 

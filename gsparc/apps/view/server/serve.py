@@ -7,7 +7,6 @@ import threading
 import time
 from typing import Any
 
-import torch
 import viser
 
 from gsparc.apps.view.latest_job import LatestJobQueue
@@ -33,7 +32,7 @@ class Server:
     def __init__(self, view: SiteView, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.view, self.work = view, LatestJobQueue()
         self.sessions: dict[int, Session] = {}
-        self._lock, self._threads = threading.Lock(), torch.get_num_threads()
+        self._lock = threading.Lock()
         self._gone: set[int] = set()  # clients that left before their session was there
         view.station(view.viewed.stations[0])  # made before anyone waits for it
         try:
@@ -51,7 +50,7 @@ class Server:
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def _came(self, client: Any) -> None:
-        session = Session(client, self.view, self.work, self._threads)
+        session = Session(client, self.view, self.work)
         with self._lock:
             gone = client.client_id in self._gone  # while its session was made
             self._gone.discard(client.client_id)

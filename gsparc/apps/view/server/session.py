@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
 from gsparc.apps.maps.area import Grid
@@ -24,14 +22,11 @@ from gsparc.apps.view.building import (
     SPHERE,
     SPLATS,
     VALUES,
-    cloud_colours,
-    cloud_of,
     rays_of,
 )
 from gsparc.apps.view.latest_job import LatestJobQueue
-from gsparc.apps.view.panel import response_db, spectrum_image, tones_mhz
+from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import Plane, beyond_distance, refining, sheet, weakest
-from gsparc.apps.view.ply import ply_bytes
 from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
 from gsparc.apps.view.scene import EXTENT, Points
 from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
@@ -41,28 +36,17 @@ PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothin
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
 CLOUD = {"points": GAUSSIANS, "ellipsoids": SPLATS}
-PADDING = (12, 8, 0, 0)  # of plots: else their highest number is cut [pixels]
-KEPT = 50  # times that a median is taken of
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-DOTS = (
-    {"width": 0, "stroke": COLOURS[0], "points": {"show": True, "size": 7}},
-    {"width": 0, "stroke": COLOURS[1], "points": {"show": True, "size": 10, "fill": COLOURS[1]}},
-)
-LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
 
 
 class Session:
     """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it."""
 
-    def __init__(self, client: Any, view: SiteView, work: LatestJobQueue, threads: int) -> None:
-        self.client, self.view, self.work, self.threads = client, view, work, threads
+    def __init__(self, client: Any, view: SiteView, work: LatestJobQueue) -> None:
+        self.client, self.view, self.work = client, view, work
         self.site = view.viewed.site
         self.station = self.chosen_station = view.viewed.stations[0]
         self.one = view.station(self.station)
         self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
-        self.asked_s = time.perf_counter()
-        self.delays: deque[float] = deque(maxlen=KEPT)
-        self.queries: deque[float] = deque(maxlen=KEPT)
         self.answers = 0  # that were shown
         self.plane: Plane | None = None
         self.visited: list[np.ndarray] = []  # weak places of it, one after another
@@ -122,7 +106,6 @@ class Session:
             choice.on_update(lambda event: self._station_changed(event.target.value))
         self.answer_text = gui.add_markdown("asking ...")
         self.picture: Any = None
-        self.curves: dict[str, Any] = {}
         self.vectors = {}
         for end, place in self.places.items():
             vector = gui.add_vector3(f"{ENDS[end]} [m]", tuple(np.round(place, 3)), step=0.01)
@@ -134,17 +117,6 @@ class Session:
         with gui.add_folder("Colours"):
             self.legend = gui.add_html("")
         self._layers_panel(gui)
-        with gui.add_folder("Operating point"):
-            last = len(viewed.ways) - 1
-            self.way = None
-            if last:
-                self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
-                self._on(self.way, self._way_changed)
-            self.speed = gui.add_markdown("")
-            if viewed.ways[0].point is not None and last:
-                figure, _ = viewed.ways[0].point.figure
-                title = f"{figure} by ms of a query, as swept; filled: this one"
-                self.front = self._plot(self._front(), title, DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
         self._legends()
@@ -158,8 +130,6 @@ class Session:
                 self._on(chosen, partial(self._show_only, points))
             if has[GAUSSIANS]:
                 self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._show_only, CLOUD))
-                button = gui.add_button("download Gaussians as PLY")
-                button.on_click(lambda _: self._download())
             self.chosen: Any = None
             if self.view.grid is not None or self.map_layers:
                 known = self.one.about.usual
@@ -184,8 +154,6 @@ class Session:
             notes.append(
                 "both ends moved: measured points are where the receiver was, wherever its transmitter"
             )
-        if len(self.view.viewed.ways) == 1:
-            notes.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
         return notes
 
     def _on(self, handle: Any, act: Any) -> None:
@@ -242,21 +210,6 @@ class Session:
         elif visible and (part := self.scene.part(name)) is not None:
             self.nodes[name] = draw(self.client.scene, self.scene.frame, part)
 
-    def _way_changed(self, value: int) -> None:
-        self.queries.clear()
-        self.delays.clear()
-        self.front.data = self._front()
-        self.want_answer()
-
-    def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
-        that of the chosen one, NaN elsewhere."""
-        points = [one.point for one in self.view.viewed.ways]
-        swept = sorted((one.p50_ms, one.figure[1], k) for k, one in enumerate(points) if one is not None)
-        took, reached, number = np.array(swept).T
-        chosen = len(points) - 1 if self.way is None else self.way.value
-        return took, reached, np.where(number == chosen, reached, np.nan)
-
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
         self.chosen_station = value
@@ -266,17 +219,10 @@ class Session:
         if self.chosen_station == value:
             self.work.ask((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
 
-    def _download(self) -> None:
-        cloud = cloud_of(self.view.viewed, self.station, self.one.measured)
-        if cloud is not None:
-            content = ply_bytes(cloud, cloud_colours(cloud)[1])
-            self.client.send_file_download("gaussians.ply", content, save_immediately=True)
-
     # -- what the worker does ----------------------------------------------------------------------
 
     def want_answer(self) -> None:
         """Have the present places answered."""
-        self.asked_s = time.perf_counter()
         self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
 
     def want_plane(self) -> None:
@@ -298,99 +244,41 @@ class Session:
         yield
 
     def _answered(self) -> Iterator[None]:
-        since, places = self.asked_s, {end: at.copy() for end, at in self.places.items()}
-        way = -1 if self.way is None else int(self.way.value)
-        point, threads, label, accuracy = self.view.viewed.ways[way].point, self.threads, "as trained", ""
-        if point is not None:
-            threads, label = (point.threads, point.label) if point.settings else (threads, label)
-            accuracy = ", {} {:.4g}".format(*point.figure)
-        if threads != torch.get_num_threads():
-            torch.set_num_threads(threads)
         try:
-            answer = ask(self.view.viewed.predictor_of(self.station, way), places)
+            answer = ask(self.view.viewed.predictor_of(self.station), dict(self.places))
         except ValueError as error:
             self.answer_text.content = f"**{error}**"
             return
         self._show(answer)
         self.answers += 1
-        self.queries.append(answer.query_ms)
-        self.delays.append((time.perf_counter() - since) * 1e3)
-        self.speed.content = (
-            f"{label}{accuracy}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons "
-            f"and drawing {np.median(self.delays):.1f} ms (medians of the last {len(self.queries)})"
-        )
+        self.work.ask((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
 
     def _show(self, answer: Answer) -> None:
-        one = self.one
-        why = reasons(answer, self.view.viewed.moving[-1], one.about)
+        why = reasons(answer, self.view.viewed.moving[-1], self.one.about)
+        rays, first = rays_of(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
         with self.client.atomic():
             self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
-            if answer.spectrum is not None:
-                self._show_spectrum(answer.spectrum, answer.ends.get("rx"))
-            if answer.response is not None:
-                self._show_response(answer.response)
-            self._show_rays(answer)
-
-    def _show_spectrum(self, spectrum: np.ndarray, receiver: np.ndarray | None) -> None:
-        image = spectrum_image(spectrum)
-        if self.picture is None:
-            left, right, low, high = self.site.grid.edges()  # type: ignore[union-attr]
-            label = (
-                f"power by direction at the receiver: azimuth {round(left)} to {round(right)}° to the "
-                f"right, elevation {round(low)} to {round(high)}° upwards"
-            )
-            self.picture = self.client.gui.add_image(image, label=label, jpeg_quality=85, order=self._after())
-        else:
-            self.picture.image = image
-        if self.sphere is not None and receiver is not None:
-            self.nodes[SPHERE].position = self.scene.frame.drawn(receiver)
-            self.nodes[SPHERE].colors = self.sphere.colours(spectrum)
-
-    def _show_response(self, response: np.ndarray) -> None:
-        if response.size == 1:
-            return
-        lines = np.atleast_2d(response_db(response))
-        if response.shape[1] > 1:
-            x, title = tones_mhz(self.site, response.shape[1]), "channel [dB] by frequency [MHz]"
-            if len(lines) > 1:
-                title += f", {len(lines)} of {len(response)} antennas"
-        else:
-            x, title = np.arange(len(response), dtype=np.float64), "channel [dB] by antenna"
-        self._curve("channel", (x, *lines), title, LINES)
-
-    def _show_rays(self, answer: Answer) -> None:
-        rays = rays_of(answer, self.view.extent(self.station))
-        if rays is not None:
-            first = RAYS not in self.nodes
+            if answer.spectrum is not None and self.sphere is not None and "rx" in answer.ends:
+                self.nodes[SPHERE].position = self.scene.frame.drawn(answer.ends["rx"])
+                self.nodes[SPHERE].colors = self.sphere.colours(answer.spectrum)
             for part in rays:
                 self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
-            if first:
-                self._legends()
-        if answer.paths is None or not len(answer.paths.gain_db):
-            return
-        order = np.argsort(answer.paths.delay_ns)
-        data = (answer.paths.delay_ns[order], answer.paths.gain_db[order])
-        self._curve("delays", data, "paths: gain [dB] by delay [ns]", DOTS)
+        if rays and first:
+            self._legends()
 
-    def _curve(self, name: str, data: tuple[np.ndarray, ...], title: str, looks: Any) -> None:
-        """A plot below what is said, made when there is first something to draw."""
-        if name in self.curves:
-            self.curves[name].data = data
+    def _panel_of(self, answer: Answer) -> Iterator[None]:
+        """The picture of an answer, which takes longer than the answer: a drag does not wait for it."""
+        image = panel_image(answer, self.site, self.one.about.usual, self.view.unit)
+        if self.picture is None:
+            self.picture = self.client.gui.add_image(
+                image, jpeg_quality=85, order=self.answer_text.order + 0.1
+            )
         else:
-            self.curves[name] = self._plot(data, title, looks, self._after())
-
-    def _plot(self, data: Any, title: str, looks: Any, order: float | None = None) -> Any:
-        series = ({}, *looks[: len(data) - 1])
-        return self.client.gui.add_uplot(
-            data, series, title=title, scales={"x": {"time": False}}, legend={"show": False}, height=170,
-            order=order, padding=PADDING,
-        )  # fmt: skip
-
-    def _after(self) -> float:
-        return float(self.answer_text.order) + 0.1 + 0.1 * len(self.curves)
+            self.picture.image = image
+        yield
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
