@@ -15,9 +15,9 @@ GENERAL = {"solve", "inv", "lstsq", "lu_factor", "lu_solve"}  # of numpy.linalg,
 EXCEPTIONS = {  # who solves a system for itself, and why
     "gsparc/models/baselines/kriging.py": "an independent check of the engine",
     "gsparc/models/baselines/ridge.py": "a baseline: complex ridge regression, no covariance of places",
-    "gsparc/prediction/export.py": "a baseline's filter over tones, no covariance of places",
-    "gsparc/prediction/along/taps.py": "taps of a delay line by least squares, no covariance of places",
-    "gsparc/evaluation/link/pusch.py": "the receiver's filter of a link, no covariance of places",
+    "gsparc/prediction/channels.py": "a baseline's filter over tones, no covariance of places",
+    "gsparc/apps/export/along/taps.py": "taps of a delay line by least squares, no covariance of places",
+    "gsparc/apps/link/pusch.py": "the receiver's filter of a link, no covariance of places",
     "gsparc/data/datasets/powder.py": "a map from degrees to metres by least squares",
     "gsparc/data/checks/level_steps.py": "a mean law by least squares",
     "gsparc/data/checks/conventions.py": "the lobe about a strongest direction by least squares",
@@ -58,7 +58,7 @@ def test_each_operation_is_in_its_place_alone():
     assert where["factor"] == {FACTOR}
     assert where["general"] == set(EXCEPTIONS), where["general"] ^ set(EXCEPTIONS)
     # The probability of a silent row alone, nothing is propagated.
-    silence = {"gsparc/locate/likelihood.py", "gsparc/data/links/strongest.py"}
+    silence = {"gsparc/apps/locate/likelihood.py", "gsparc/data/links/strongest.py"}
     silence.add("gsparc/models/powers/together/network.py")
     assert where["expectation propagation"] == {"gsparc/processes/censored.py"} | silence
     assert defined["left_out_group"] == ["gsparc/processes/left_out.py"]
