@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import yaml
-from cities import COUNT, folder
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, snapshots, world
@@ -61,13 +59,3 @@ def test_offsets_are_a_switch() -> None:
     angle = np.angle((turned * clean.conj()).sum((1, 2)))
     assert np.ptp(angle) > 3
     assert np.ptp(np.angle((still * clean.conj()).sum((1, 2)))) < 0.1
-
-
-def test_layout_is_the_release_s() -> None:
-    place = folder()
-    csi = np.load(place / "csidata.npy")
-    assert csi.shape == (COUNT, 8, 52) and csi.dtype == np.complex64
-    content = yaml.safe_load((place / "base-station.yml").read_text())
-    assert np.shape(content["base_station"]) == (8, 3) and content["dataset_name"] == "argos-sim"
-    assert np.load(place / "csidata-64.npy").shape == (COUNT, 64, 52)
-    assert not list(place.parent.glob("*.partial"))
