@@ -126,12 +126,6 @@ def test_a_refused_file_is_not_written(tmp_path, csi_arrays):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_single_row_leaves_no_trace_in_the_scale(csi_arrays):
-    first = from_arrays(csi_arrays).site.target_scale
-    csi_arrays["csi"][0] *= 1.01
-    assert from_arrays(csi_arrays).site.target_scale == first
-
-
 def test_newrf_conference(real_newrf):
     data = load({"name": "newrf", "file": str(real_newrf)})
     assert data.site.kind == "csi" and data.site.static_end == "tx" and data.site.grid is None

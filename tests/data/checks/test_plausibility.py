@@ -226,14 +226,6 @@ def test_real_outages_are_not_taken_for_silence(campus):
     assert not any("sensitivity_db" in line for line in found)
 
 
-def test_other_real_campaigns_raise_few(campus):
-    for name in ("ble-hall-1", "ble-hall-2"):
-        found = warnings_of(real_links(name))
-        assert len(found) <= 1, found
-    assert plausibility.level_warnings(campus.level_db) == []
-    assert plausibility.direction_warnings(campus) == []
-
-
 def test_copies_in_a_file_of_links_were_one_row():
     """Rows of one place and station were entered into one cell before anyone looked for copies."""
     place, level, station = walk(0, 60)
