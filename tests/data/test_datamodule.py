@@ -38,14 +38,6 @@ def test_order_is_pinned():
     assert order(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
 
 
-def test_loader_starts_where_it_is_told(data):
-    whole = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
-    rest = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0, first_step=lambda: 2)]
-    assert len(whole) == 3 and rest == whole[2:]
-    second = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0, first_step=lambda: 3)]
-    assert len(second) == 3 and second != whole
-
-
 def test_empty_pool_is_refused(data):
     with pytest.raises(ValueError, match="training rows"):
         StepLoader(data, np.array([], dtype=np.int64), 4, seed=0)

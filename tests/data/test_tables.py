@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-from gsparc.data.datasets.own import Own
 from gsparc.data.own import interpret
 from gsparc.data.tables.heads import understand
 from gsparc.data.tables.read import understand_table
@@ -209,14 +208,6 @@ def test_two_ends_in_degrees_become_stations(write):
     arrays = understand_table(write(text + "40,8.3,40.3,8,-80\n")).raw.arrays
     assert arrays["station_latitude"].tolist() == [40.1, 40.3] and arrays["station"].tolist() == [0, 0, 1, 1]
     assert arrays["longitude"].tolist() == [8, 8.1, 8.2, 8.3]
-
-
-def test_the_dataset_own_reads_tables(write):
-    rng = np.random.default_rng(0)
-    rows = "".join(f"{x:.3f},{y:.3f},1,5,5,2,{-40 - x - y:.2f}\n" for x, y in rng.uniform(0, 4, (30, 2)))
-    path = write("x,y,z,tx_x,tx_y,tx_z,RSRP\n" + rows)
-    data = Own(path, columns={"rssi_db": "RSRP", "lat": None}).measurements
-    assert len(data) == 30 and data.site.static_end == "tx" and data.row_names[0] == "line 2"
 
 
 def test_line_breaks_in_quoted_cells_were_refused(write):

@@ -38,17 +38,6 @@ def test_building_blocks_and_its_corner_diffracts() -> None:
     assert 0 < np.abs(behind.gain).max() < 0.5 * 0.125 / (4 * np.pi * 20)
 
 
-def test_delay_spread_and_received_power() -> None:
-    there = world(400, seed=0)
-    power, delay = np.abs(there.rays.gain) ** 2, there.rays.delay
-    share = power / power.sum(1, keepdims=True)
-    mean = (share * delay).sum(1, keepdims=True)
-    spread = np.sqrt((share * (delay - mean) ** 2).sum(1))
-    assert 50e-9 <= np.median(spread) <= 100e-9
-    power = power.sum(1)
-    assert (power > there.noise_power * 10**0.5).all()
-
-
 def test_offsets_are_a_switch() -> None:
     there = world(40, seed=0)
     clean = there.response(CARRIER_HZ + TONES * SPACING_HZ)

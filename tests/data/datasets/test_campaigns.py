@@ -153,16 +153,6 @@ def test_values_that_were_never_written_are_none(tmp_path):
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
-def test_powder_npz_is_geographic(tmp_path):
-    held, arrays = raw_of_powder(write_npz(tmp_path, "powder")).arrays, powder_arrays()
-    assert np.array_equal(held["latitude"], arrays["latitude"]) and "tx_position" not in held
-    where = np.stack([held["station_latitude"], held["station_longitude"]], axis=1)
-    assert np.abs(where - DEGREES).max() < 1e-9  # a tenth of a millimetre
-    assert held["station_name"].tolist() == STATIONS.tolist() and held["carrier_hz"] == 462.7e6
-    assert held["tx_height"] == 1.5 and held["station_height"] == 10
-    assert np.array_equal(held["rssi_db"], arrays["rssi_db"], equal_nan=True)
-
-
 def equal(one: np.ndarray, other: np.ndarray) -> bool:
     if one.dtype.kind == "f":
         return np.allclose(one, other, rtol=0, atol=1e-9, equal_nan=True)

@@ -69,11 +69,6 @@ def test_three_access_points_by_their_positions_alone():
     assert any("taken as 3 stations" in note for note in found.notes)
 
 
-def test_both_ends_may_move():
-    data = read({"rx_position": WALK, "tx_position": WALK + 1, "rssi_db": LEVELS[:, 0]}).data
-    assert data.site.static_end is None and data.moving.shape == (PLACES, 6)
-
-
 def test_powers_may_have_an_unknown_transmitter():
     found = read({"rx_position": WALK, "rssi_db": LEVELS[:, 0]})
     assert found.data.site.static_position is None and np.isnan(found.data.tx).all()
