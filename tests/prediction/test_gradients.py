@@ -27,10 +27,10 @@ from gsparc.models.channels import complex_gp
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.closed_forms import Powers
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.named import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings

@@ -16,12 +16,12 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.closed_forms import ClosedForms
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
+from gsparc.models.mixture.named import NamedMixture
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
@@ -104,7 +104,7 @@ def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Gsparc):
         return exact_form(method.chosen, site)
-    if isinstance(method, ClosedForms):
+    if isinstance(method, NamedMixture):
         return None if method.solution.only is None else exact_form(method.solution.only, site)
     if isinstance(method, Residual):
         return exact_form(method.method, site) if method.rest is None or not method.share else None

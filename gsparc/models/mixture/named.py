@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
-class ClosedForms(LearnsTogether):
+class NamedMixture(LearnsTogether):
     """Solutions whose weights follow from the rows in closed form, weighed by held-out groups.
 
     Args:
@@ -251,61 +251,61 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
     return waves.runs
 
 
-class ImageSources(ClosedForms):
+class ImageSources(NamedMixture):
     """Image sources, found by searches or along measured directions, beside a process of waves."""
 
     name = "image_sources"
 
     def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = searched if self.init.name == "auto" else (str(self.init.name),)
         # Offsets are known to sources alone.
         return (*placed, "diffuse") if self.plain and self.init.snapshot == "none" else placed
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return no_phase(data)
 
 
-class Channels(ClosedForms):
+class Channels(NamedMixture):
     """Leakage, a direct wave and waves from all around; where rows were turned to each other, a process."""
 
     name = "channels"
 
     def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`; no phase tells of paths where rows have phases of their own."""
+        """See `NamedMixture`; no phase tells of paths where rows have phases of their own."""
         return ("aligned",) if data.site.phase_reference == "neighbours" else ("diffuse",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return None if data.site.kind == "csi" else f"the target is {data.site.kind}, not channels"
 
 
-class Powers(ClosedForms):
+class Powers(NamedMixture):
     """A process of decibels about a distance law; of several stations, about a law of the site."""
 
     name = "powers"
 
     def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`; `init=scene` knows walls."""
+        """See `NamedMixture`; `init=scene` knows walls."""
         several = data.site.stations is not None and len(data.site.stations) > 1
         return ("scene",) if self.init.name == "scene" else ("joint_powers",) if several else ("powers",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 
 
-class Bearings(ClosedForms):
+class Bearings(NamedMixture):
     """Sources where bearings of a moving array cross, with processes of powers, beside the plain process."""
 
     name = "bearings"
 
     def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return ("bearings", "process") if self.plain and len(data) <= PROCESS_ROWS else ("bearings",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return no_array(data.site, "tx", "the receiver stands still")
