@@ -56,9 +56,11 @@ def test_each_operation_is_in_its_place_alone():
                 elif (of, called) == ("", "solved") and "gram" in ast.unparse(node):
                     where["systems of nearest rows"].add(name)
     assert where["factor"] == {FACTOR}
-    assert where["general"] == set(EXCEPTIONS), where["general"] ^ set(EXCEPTIONS)
+    there = {name for name in EXCEPTIONS if (ROOT / name).is_file()}  # the core may stand alone
+    assert where["general"] == there, where["general"] ^ there
     # The probability of a silent row alone, nothing is propagated.
-    silence = {"gsparc/apps/locate/likelihood.py", "gsparc/data/links/strongest.py"}
+    silence = {f"gsparc/{name}.py" for name in ("apps/locate/likelihood", "data/links/strongest")}
+    silence = {name for name in silence if (ROOT / name).is_file()}
     silence.add("gsparc/models/powers/together/network.py")
     assert where["expectation propagation"] == {"gsparc/processes/censored.py"} | silence
     assert defined["left_out_group"] == ["gsparc/processes/left_out.py"]
