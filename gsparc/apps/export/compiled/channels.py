@@ -23,10 +23,10 @@ def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     count, rows = len(pack.sources), len(pack.places)
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES
     weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
-    array, moving = static_array(site, method.antennas), np.zeros((1, 3))
+    array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
     if site.moving_end == "rx":
         still = Pose(torch.zeros(3), torch.from_numpy(np.asarray(rotation, np.float32)))
-        moving = query_elements(site, still, 1, method.antennas)[0].numpy()
+        moving = query_elements(site, still, 1, method.frame.antennas)[0].numpy()
     images = pack.sources[None]
     if array is not None:
         images = images + torch.einsum("kij,ej->eki", pack.orientations, torch.from_numpy(array))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,13 +16,13 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.closed_forms import ClosedForms
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
 from gsparc.models.splat.averaged import ImageProcess
@@ -105,8 +104,14 @@ def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Gsparc):
         return exact_form(method.chosen, site)
-    if isinstance(method, ClosedForms):
-        return _of_field(method.field, site)
+    if isinstance(method, NamedMixture):
+        return None if method.solution.only is None else exact_form(method.solution.only, site)
+    if isinstance(method, Residual):
+        return exact_form(method.method, site) if method.rest is None or not method.share else None
+    if isinstance(method, PowerField):
+        if method.powers is None or method.fringes is not None:
+            return None
+        return powers_form(method.powers, site.target_scale)
     if isinstance(method, ImageProcess) and method._average is not None:
         return exact_form(method._average[0], site) if not method.size() else None
     if isinstance(method, LearnedField):
@@ -119,20 +124,6 @@ def exact_form(method: Method, site: Site) -> Form | None:
         cluttered = any(len(member.scene.clutter) for member in method.members)
         return None if cluttered else sources_form(method, site, method.query)
     return None
-
-
-def _of_field(field: Any, site: Site) -> Form | None:
-    """Of a field with weights in closed form."""
-    if isinstance(field, Mixture):
-        parts = list(field.parts())
-        alone = len(parts) == 1 and (field.residual is None or not field.share)
-        return _of_field(parts[0][1], site) if alone else None
-    if isinstance(field, PowerField):
-        if field.process is None or field.fringes is not None:
-            return None
-        return powers_form(field.process, site.target_scale)
-    method = getattr(field, "method", None)
-    return None if method is None else exact_form(method, site)
 
 
 def _rendered(method: LearnedField, site: Site) -> Form | None:
@@ -174,9 +165,9 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
 
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
-    field = getattr(method, "field", None)
-    parts = [] if field is None else sorted(field.parts(), key=lambda one: -one[0])
-    for one in [method, *(getattr(part, "method", None) for _, part in parts)]:
+    solution = getattr(method, "solution", None)
+    parts = [] if solution is None else sorted(solution.parts(), key=lambda one: -one[0])
+    for one in [method, *(part for _, part in parts)]:
         if isinstance(one, ImageSourceGP):
             return one
     raise ValueError(
