@@ -325,7 +325,9 @@ def far_from(
     return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
 
 
-def far_apart(positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int]) -> np.ndarray:
+def far_apart(
+    positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
+) -> np.ndarray:
     """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
     tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
     subset = []

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.link.adaptation import Rates, Rule
 from gsparc.evaluation.link.channels import channels, on_band
 from gsparc.evaluation.link.pusch import RECEIVERS, Pusch, frequency_correlation
@@ -26,7 +25,7 @@ from gsparc.evaluation.link.study import (
 )
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.export import SUBCARRIERS_PER_BLOCK, centred
-from gsparc.prediction.risk_threshold import Guarantee
+from gsparc.prediction.risk import Guarantee, accept
 
 log = logging.getLogger(__name__)
 
