@@ -1,6 +1,6 @@
 """Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
 
-docs/reference/schema.md documents it; `fields.py` is its table. `interpret` turns arrays into measurements
+docs/reference/schema.md documents it; fields.csv is its table. `interpret` turns arrays into measurements
 or lists everything that is wrong, `load_own` is its strict form, `write_own` refuses what `load_own` would.
 """
 

@@ -37,6 +37,9 @@ class Campaign(DataModule):
     """
 
     choice: ClassVar[str]  # of conf/dataset
+    marks: ClassVar[frozenset[str]] = frozenset()  # arrays that an npz of it has, and of no other
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of files of the release
+    inside: ClassVar[str] = ""  # pattern of a file that folders of the release hold
     switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 

@@ -159,3 +159,4 @@ class Techtile(Campaign):
     """Channels of a moving transmitter at 42 antennas; settings of `raw_of_techtile` and of `Campaign`."""
 
     choice, reader = "techtile", staticmethod(raw_of_techtile)
+    marks, suffixes = frozenset({"rx_antenna_position", "csi"}), NETCDF_SUFFIXES

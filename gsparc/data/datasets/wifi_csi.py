@@ -194,3 +194,4 @@ class WifiCsi(Campaign):
     """Wi-Fi channels as cards log them; settings of `raw_of_wifi_csi` and `Campaign`."""
 
     choice, reader = "wifi_csi", staticmethod(raw_of_wifi_csi)
+    inside = "*.pcap"

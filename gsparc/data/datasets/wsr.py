@@ -223,3 +223,4 @@ class WSR(Campaign):
     """Channels of 30 tones of a robot that drives; settings of `raw_of_wsr` and `Campaign`."""
 
     choice, reader = "wsr", staticmethod(raw_of_wsr)
+    inside, marks = "**/csi_rx_*.dat", frozenset({"h2", "root_sign"})

@@ -29,7 +29,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     station_names,
 )
-from gsparc.data.tables.heads import PERCENT, words_of
+from gsparc.data.tables.heads import LISTS, PERCENT, words_of
 from gsparc.data.tables.opening import read_parquet, sheet_of
 from gsparc.data.tables.places import (
     PER_STATION,
@@ -93,7 +93,6 @@ def understand_table(
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
-HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
 
 class Builder:
@@ -258,7 +257,7 @@ class Builder:
             named = named or [stay] * bool(stay)
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
-            if not named and station and station[0].word in HEARING:
+            if not named and station and station[0].word in LISTS["hearing"]:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
