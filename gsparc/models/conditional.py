@@ -8,6 +8,7 @@ covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it i
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -73,6 +74,10 @@ class ConditionalField(ABC):
 
         Followed by autograd, and of double precision, where positions are float64.
         """
+
+    def parts(self) -> Iterator[tuple[float, ConditionalField]]:
+        """Yield fields that are no mixtures, with their weights in the mean."""
+        yield 1.0, self
 
     def objects(self) -> SiteObjects:
         """What it found to stand in the site."""

@@ -8,6 +8,7 @@ with input noise", NeurIPS 2011) leave J d as noise instead. Rows measured at on
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
 
@@ -15,11 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
+
+log = logging.getLogger(__name__)
 
 SHARES = np.logspace(-3, 1.5, 46)  # c, candidates
 
@@ -37,6 +42,27 @@ class Linearised:
     residual: Tensor
     slope: Tensor
     variance: Tensor
+
+
+def errors_of(data: Measurements, fold: Fold, asked: float | None, heeds: bool) -> np.ndarray | None:
+    """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is heeded.
+
+    Args:
+        data: says errors where nobody asks.
+        fold: its training and validation rows are known.
+        asked: of every coordinate [m].
+        heeds: whether what is fitted can place rows anew; where not, a warning says so.
+    """
+    with heeded.apart():
+        std = data.position_std if asked is None else np.full(len(data), asked)
+    if std is None or not std[np.concatenate([fold.train, fold.val])].any():
+        return None
+    if heeds:
+        heeded.count("model.position_std")
+        return std
+    what = "channels with phases of the carrier and powers, of one end that moves"
+    log.warning("position_std is not used: it is for %s", what)
+    return None
 
 
 def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.conditional import ConditionalField
 from gsparc.models.fields import INITIALISERS
+from gsparc.models.method import Method
 from gsparc.models.per_station import of_station
 from gsparc.models.powers.together.network import network_of
 from gsparc.models.target_rows import heard
@@ -24,6 +25,27 @@ from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
 PLAIN = InitSettings("diffuse")  # no Gaussians: asked is what stations share
+
+
+class LearnsTogether(Method):
+    """Learns several stations of a site in one field, or each in its own."""
+
+    both_ends = True
+    takes_budget = True
+    init: InitSettings
+
+    def shares(self, site: Site) -> bool:
+        """Received powers, and channels of a known carrier with its phases."""
+        waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
+        return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
+
+    def best_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """See `Method.best_stations`."""
+        if not self.shares(data.site) or self.init.name == "scene":
+            return "each", ""
+        return best(data, fold, context)
 
 
 def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:

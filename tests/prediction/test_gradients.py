@@ -24,7 +24,7 @@ from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines import gp
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.initial import ChannelSettings, initialise
-from gsparc.models.gsparc import Gsparc
+from gsparc.models.closed_forms import Powers
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.source_field import SourceField
 from gsparc.models.method import Method, Prediction
@@ -89,7 +89,7 @@ def planned(*more: str) -> Callable[[], Method]:
     return lambda: build(compose("model=gsparc", *more).model)
 
 
-class Assembled(Gsparc):
+class Assembled(Powers):
     """A field of what `method` found, with two fields of waves beside it where it is one of channels."""
 
     def __init__(self, method: Method) -> None:

@@ -41,12 +41,9 @@ class Mixture(ConditionalField):
             self.held = members[0].held
 
     def parts(self) -> Iterator[tuple[float, ConditionalField]]:
-        """Fields that are no mixtures, with their weights in the mean."""
+        """See `ConditionalField`."""
         for weight, one in zip(self.weights, self.members, strict=True):
-            if isinstance(one, Mixture):
-                yield from ((weight * more, part) for more, part in one.parts())
-            else:
-                yield weight, one
+            yield from ((weight * more, part) for more, part in one.parts())
 
     @property
     def count(self) -> int:

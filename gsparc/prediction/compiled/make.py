@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,14 +13,16 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.closed_forms import ClosedForms
+from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
-from gsparc.models.planned_field import PlannedField
 from gsparc.models.powers.field import PowerField
+from gsparc.models.splat.averaged import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.prediction.compiled.blob import Form
@@ -100,11 +103,12 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 
 def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
-    if isinstance(method, PlannedField):
-        if method.field is not None:
-            return _of_field(method.field, site)
-        if method._average is not None:
-            return exact_form(method._average[0], site) if not method.size() else None
+    if isinstance(method, Gsparc):
+        return exact_form(method.chosen, site)
+    if isinstance(method, ClosedForms):
+        return _of_field(method.field, site)
+    if isinstance(method, ImageProcess) and method._average is not None:
+        return exact_form(method._average[0], site) if not method.size() else None
     if isinstance(method, LearnedField):
         return _rendered(method, site)
     if isinstance(method, GaussianProcess):
@@ -149,11 +153,12 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
         ValueError: channels that are not made of sources.
     """
     method, site = predictor.method, predictor.site
-    if isinstance(method, PlannedField) and method.field is None and method._average is not None:
+    method = method.chosen if isinstance(method, Gsparc) else method
+    if isinstance(method, ImageProcess) and method._average is not None:
         own_form = _rendered(method, site)  # without the process that it is averaged with
         if own_form is not None:
-            alone = LearnedField.__new__(type(method))
-            alone.__dict__.update(method.__dict__, _average=None)
+            alone = copy.copy(method)
+            alone._average = None
             return replace(own_form, predictor=Predictor(alone, site))
     sources = _sources_of(method) if site.kind == "csi" else None
     data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
@@ -170,7 +175,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
     field = getattr(method, "field", None)
-    parts = sorted(field.parts(), key=lambda one: -one[0]) if isinstance(field, Mixture) else [(1.0, field)]
+    parts = [] if field is None else sorted(field.parts(), key=lambda one: -one[0])
     for one in [method, *(getattr(part, "method", None) for _, part in parts)]:
         if isinstance(one, ImageSourceGP):
             return one

@@ -19,14 +19,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models import checkpoint, loading
-from gsparc.models.gsparc import Gsparc, plan
+from gsparc.models.gsparc import Gsparc, choose
 from gsparc.models.per_station import for_links
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together.field import JointPowerField, initialise, most_each
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.registry import method_class
-from gsparc.models.terms import EffectSettings
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
@@ -247,7 +246,7 @@ def test_what_it_refuses():
     with pytest.raises(ValueError, match="at least one row"):
         initialise(data, np.arange(0))
     with pytest.raises(ValueError, match="stations=each"):
-        plan(EffectSettings(), InitSettings(name="scene", file="walls.yaml"), data, 0)
+        choose(data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
     own, terms = prior_of(data)
     with pytest.raises(ValueError, match="condition it first"):
         JointPowerField(data.site, POSTS, own, terms, terms).left_out()
