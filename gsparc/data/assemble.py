@@ -51,9 +51,8 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     for part in blocks(values):
         rows = values[part][usual[part]]
         # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
-        magnitude = (
-            np.abs(rows if weight is None else rows[weight[part][usual[part]]]).astype(np.float64) / peak
-        )
+        rows = rows if weight is None else rows[weight[part][usual[part]]]
+        magnitude = np.abs(rows).astype(np.float64) / peak
         total, count = total + float((magnitude**2).sum()), count + magnitude.size
     return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
 

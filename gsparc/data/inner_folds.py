@@ -184,15 +184,12 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
             cut = [f for corner in corners for f in make_split(where, replace(settings, corner=corner)).folds]
             chosen = rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
             unit = np.full(len(where), NOT_TESTED)
-            for number, i in reversed(
-                list(enumerate(chosen))
-            ):  # a row of two folds is counted with the first
+            for number, i in reversed([*enumerate(chosen)]):  # a row of two folds is counted with the first
                 unit[cut[i].test] = number
             return InnerFolds(settings.name, tuple(cut[i] for i in chosen), unit)
     settings = replace(settings, name="random")
-    folds = tuple(
-        make_split(where, settings, pair).folds[0] for pair in _pieces(len(where), settings, count, rng)
-    )
+    pieces = _pieces(len(where), settings, count, rng)
+    folds = tuple(make_split(where, settings, pair).folds[0] for pair in pieces)
     return InnerFolds("random", folds, np.arange(len(where)))
 
 

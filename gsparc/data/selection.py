@@ -267,10 +267,8 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
-def known_station(
-    wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
-) -> int:
-    """`station_number`; the setting `option` is named in errors.
+def known_station(wanted: str | int, names: Sequence[str], count: int, option: str, file: str | Path) -> int:
+    """`station_number`; the setting `option` of a `file` is named in errors.
 
     Raises:
         DataError: there is none.
@@ -279,8 +277,8 @@ def known_station(
     if number is not None:
         return number
     if not names or (isinstance(wanted, int) and not any(name.isdigit() for name in names)):
-        raise DataError(f"{option}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"{option}: no station {wanted} in {source}{suggest(str(wanted), names)}")
+        raise DataError(f"{option}: {file} has stations 0 to {count - 1}")
+    raise DataError(f"{option}: no station {wanted} in {file}{suggest(str(wanted), names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:

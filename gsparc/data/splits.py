@@ -31,9 +31,8 @@ LEAST_ROWS = 4  # fewer training rows than this teach nothing
 NEAR = 0.01  # of the usual step: places nearer than this are visits of one
 FEWEST_PLACES, SAMPLE = 10, 10_000  # that tell a usual step; more tell nothing more
 # Large odd factors: cells become numbers, which sort much faster than rows.
-MIXING = 2**62 + np.array(
-    [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
-)
+_ODD = [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
+MIXING = 2**62 + np.array(_ODD)
 EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
@@ -316,13 +315,11 @@ def path_order(positions: np.ndarray) -> np.ndarray:
     return np.argsort(positions[:, longest], kind="stable")
 
 
-def far_from(
-    positions: np.ndarray, candidates: np.ndarray, others: np.ndarray, distance: float
-) -> np.ndarray:
-    """Those `candidates` (rows) that are more than `distance` [m] away from all `others` (rows)."""
-    if len(candidates) == 0 or len(others) == 0:
-        return candidates
-    return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
+def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
+    """Those `rows` that are more than `distance` [m] away from all `others` (rows)."""
+    if len(rows) == 0 or len(others) == 0:
+        return rows
+    return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
 
 
 def far_apart(
@@ -452,9 +449,8 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
     for fold, test in enumerate(test_units):
-        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(
-            np.setdiff1d(np.arange(count), test)
-        )
+        rest = np.setdiff1d(np.arange(count), test)
+        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(rest)
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
         parts = (np.setdiff1d(rest, chosen), chosen, test)
         folds.append(Fold(*(np.flatnonzero(np.isin(unit, part)) for part in parts)))

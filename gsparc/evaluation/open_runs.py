@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.datasets.argos import published_figures, published_normalisation
 from gsparc.data.errors import DataError
 from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for, split_settings
@@ -22,7 +21,7 @@ from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.scores import rows_of
 from gsparc.models import checkpoint, loading
-from gsparc.models.method import Method, predictions
+from gsparc.models.method import Method
 from gsparc.models.registry import build
 from gsparc.prediction.confidence import Trusted, gather, keep, known_positions, position_kernel, threshold_of
 from gsparc.prediction.query import SAME_PLACE_M
@@ -327,7 +326,7 @@ def collect(
         if len(rows):
             parts.append(gather(run.methods[0], run.data, fold, rows))
         seen = np.concatenate([seen, rows])
-        facts = facts or _published(run.methods[0], run.data, fold) | run.facts()
+        facts = facts or run.facts()
     return joined(parts), facts
 
 
@@ -370,14 +369,3 @@ def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened
         advice = "calibrate with the data and split of its training"
         raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
     return run
-
-
-def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
-    """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
-    if data.uplink is None:
-        return {}
-    predicted = np.concatenate([said.mean.numpy() for _, _, said in predictions(method, data, fold.test)])
-    target = data.target[fold.test]
-    both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
-    results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
-    return {f"{room}/{name}": value for room, one in results.items() for name, value in one.items()}

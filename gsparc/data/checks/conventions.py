@@ -192,9 +192,9 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
     count = min(DELAYS * len(tones), 256) if len(tones) > 1 else 1
     delays = (np.arange(count) - count // 2) / count / spacing
     antennas = direct @ np.exp(2j * np.pi * np.outer(tones - tones.mean(), delays))
-    used = measured.sum(axis=(1, 2)) / (
-        1 if signals.array is not None else measured.any(axis=2).sum(axis=1).clip(1)
-    )
+    used = measured.sum(axis=(1, 2)).astype(float)
+    if signals.array is None:
+        used /= measured.any(axis=2).sum(axis=1).clip(1)
     power = (used * (np.abs(values) ** 2).sum(axis=(1, 2))).clip(1e-300)
 
     def best(share: np.ndarray) -> tuple[np.ndarray, int]:  # likelihoods (S,) at the delay that fits best
@@ -208,9 +208,8 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
     else:
         rows, delay = best(np.abs(antennas.sum(axis=1)) ** 2)
         factor = antennas[:, :, delay].sum(axis=1)
-        other = antennas[
-            :, :, best((np.abs(antennas) ** 2).sum(axis=1))[1]
-        ]  # of antennas whose phases are free
+        # Of antennas whose phases are free.
+        other = antennas[:, :, best((np.abs(antennas) ** 2).sum(axis=1))[1]]
         if len(values) > 2 * other.shape[1]:
             level = np.sqrt((np.abs(other) ** 2).mean(axis=1, keepdims=True)).clip(1e-150)
             phases = np.angle(np.linalg.svd(other / level, full_matrices=False)[2][0])
@@ -260,10 +259,10 @@ def _decibels(signals: Signals, scale: float) -> list[str]:
     of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
     if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
         return []
-    how = (
-        f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam more than"
-    )
-    return [f"{how} 1,000 times better as decibels: dataset.decibels=true makes them linear"]
+    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g},"
+    return [
+        f"{how} fit a beam more than 1,000 times better as decibels: dataset.decibels=true makes them linear"
+    ]
 
 
 def _lobe(values: np.ndarray, directions: np.ndarray) -> float:

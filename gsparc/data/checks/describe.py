@@ -173,9 +173,8 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
     on_earth = reach.max() <= 180 and reach.min() <= 90
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
-        return [
-            f"positions near {near} within {across:.2g}: degrees? then give them as latitude and longitude"
-        ]
+        how = "then give them as latitude and longitude"
+        return [f"positions near {near} within {across:.2g}: degrees? {how}"]
     groups = outliers.two_groups(positions[:, :2])
     if groups is not None:
         by = f", as column {zones!r} says" if zones else ""
@@ -189,9 +188,8 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         return [f"{far}; {hint}"]
     if across > 1000 and (positions % 1 == 0).all():
         size = " x ".join(f"{e / 1000:.4g}" for e in extent)
-        return [
-            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
-        ]
+        said = f"positions are whole numbers up to {across:.0f} apart"
+        return [f"{said}: millimetres? the box is {size} m then"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

@@ -100,37 +100,6 @@ def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
     return straight * np.exp(-1j * phase)[:, None, None]
 
 
-def published_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex, float]:
-    """Mean and standard deviation that published loaders remove, each one number for all entries.
-
-    Args:
-        values: (S, A, K) targets.
-        train: rows they are taken over.
-    """
-    chosen = values[train].astype(np.complex128)
-    mean = complex(chosen.mean())
-    return mean, float(np.sqrt((np.abs(chosen - mean) ** 2).mean()))
-
-
-def published_figures(
-    predicted: np.ndarray, target: np.ndarray, mean: complex, spread: float
-) -> dict[str, float]:
-    """NMSE and mean SNR of all tones and of the first one, as published figures are computed.
-
-    Args:
-        predicted, target: (n, A, K), denormalised.
-        mean, spread: what is removed from both; 0 and 1 for the denormalised figures.
-    """
-    guess, truth = (predicted - mean) / spread, (target - mean) / spread
-    figures = {}
-    for name, tones in (("", slice(None)), ("_first_tone", slice(0, 1))):
-        error = (np.abs(guess[..., tones] - truth[..., tones]) ** 2).sum((1, 2))
-        power = (np.abs(truth[..., tones]) ** 2).sum((1, 2))
-        figures[f"nmse{name}"] = float(error.sum() / power.sum())
-        figures[f"snr_db{name}"] = float(np.mean(10 * np.log10(power / error)))
-    return figures
-
-
 def _channels(root: Path) -> np.ndarray:
     path = root / "csidata-64.npy"
     path = path if path.exists() else root / "csidata.npy"

@@ -31,6 +31,7 @@ HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
 SPLITS = ("train", "test")
+TrainTest = tuple[np.ndarray, np.ndarray]
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -97,13 +98,10 @@ def load_rfid(
     )  # fmt: skip
 
 
-def _read_list(
-    path: Path, count: int, problems: Problems
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, TrainTest | None]:
     """Rows (n,) that a list names, of `count`, and the (train, test) rows among them."""
-    cells = problems.attempt(
-        lambda: read_csv(path, "missing; expected a CSV with the columns spectrum,split")
-    )
+    missing = "missing; expected a CSV with the columns spectrum,split"
+    cells = problems.attempt(lambda: read_csv(path, missing))
     wrong = [
         f"line {i + 2}"
         for i, row in enumerate(cells[1:] if cells else [])

@@ -59,14 +59,12 @@ class Lists:
     place: np.ndarray
 
     @classmethod
-    def of(
-        cls, moment: np.ndarray, station: np.ndarray, level: np.ndarray, place: np.ndarray, count: int
-    ) -> Lists:
-        """Of rows (n,) of lists `moment`, `count` stations, levels [dB] and places (n, 3) [m]."""
-        number, first, which = np.unique(moment, return_index=True, return_inverse=True)
+    def of(cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int) -> Lists:
+        """Of rows (n,) of `lists`, stations `who` of `count`, levels [dB] and places `at` (n, 3) [m]."""
+        number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
-        table[which.reshape(-1), station] = level
-        return cls(int(np.isfinite(table).sum(1).max()), first, table, place[first])
+        table[which.reshape(-1), who] = level
+        return cls(int(np.isfinite(table).sum(1).max()), first, table, at[first])
 
     @property
     def full(self) -> np.ndarray:

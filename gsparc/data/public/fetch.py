@@ -117,9 +117,8 @@ def fetched(choice: str, setting: str = "file") -> Path:
         by_hand = [f"get it from {one.by_hand} and " for one in sets]
         raise DataError(f"dataset.{setting} is not set; {''.join(by_hand)}{say}")
     part = f", of which {len(missing)} are missing" if len(missing) < len(here.sources) else ""
-    raise DataError(
-        f"dataset.{setting} is not set; get it with `gsparc data {here.name}` ({here.size}{part}), or {say}"
-    )
+    how = f"get it with `gsparc data {here.name}` ({here.size}{part})"
+    raise DataError(f"dataset.{setting} is not set; {how}, or {say}")
 
 
 def found(choice: str) -> Path | None:

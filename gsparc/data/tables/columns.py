@@ -39,10 +39,7 @@ LEVELS = ("rssi_db", "rssi")
 CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS, POLAR)
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
-ONE_OF = (
-    MEASURED,
-    *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS),
-)
+ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
 LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
 _STATIONS = "|".join(sorted(STATION_WORDS))
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution
+from gsparc.data.errors import Caution, some
 from gsparc.data.files import shipped
 from gsparc.data.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
@@ -76,12 +76,8 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     if heads:
         notes.append(f"{sheet.source}: of sectors {', '.join(heads)}")
     if unread:
-        many = f" and {len(unread) - 8} more" if len(unread) > 8 else ""
-        notes.append(
-            Caution(
-                f"{sheet.source}: not read: column{'s' * (len(unread) > 1)} {', '.join(unread[:8])}{many}"
-            )
-        )
+        heads_ = f"column{'s' * (len(unread) > 1)} {some(unread, 8)}"
+        notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
     return found, notes
 
 

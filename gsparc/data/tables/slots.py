@@ -51,9 +51,8 @@ def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     for slot in slots.values():
         held = np.flatnonzero((sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != ""))
         heads = {part: slot.get(part, shared) if part == "EARFCN" else slot[part] for part in names}
-        parts.append(
-            pd.DataFrame({names[part]: columns[head].iloc[held].to_numpy() for part, head in heads.items()})
-        )
+        series_of = {names[part]: columns[head].iloc[held].to_numpy() for part, head in heads.items()}
+        parts.append(pd.DataFrame(series_of))
         rows.append(held)
     row = np.concatenate(rows)
     order = np.argsort(row, kind="stable")
