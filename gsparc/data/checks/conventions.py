@@ -19,6 +19,7 @@ import numpy as np
 
 from gsparc.data.conventions import CONVENTIONS, Signals, mended
 from gsparc.data.errors import some
+from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
 
 RATIO = math.log(1000)  # of likelihoods
@@ -81,20 +82,19 @@ def convention_warnings(data: Measurements) -> list[str]:
 
 def _arrayed(data: Measurements, signals: Signals) -> tuple[Signals, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
-    stations, place = data.site.stations, data.place
+    stations = data.site.stations
     run = np.zeros(len(data), np.int64) if data.run is None else data.run
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
     single = signals.tones is not None and signals.values.shape[1] == 1
-    if stations is None or place is None or len(stations) < COHERENT or not single:
+    if stations is None or data.place is None or len(stations) < COHERENT or not single:
         return signals, run * (int(station.max()) + 1) + station
-    _, first, of_place = np.unique(place, return_index=True, return_inverse=True)
-    shape = (len(first), len(stations), signals.values.shape[2])
-    values, mask = np.zeros(shape, signals.values.dtype), np.zeros(shape, bool)
-    values[of_place, station] = signals.values[:, 0]
-    mask[of_place, station] = True if signals.mask is None else signals.mask[:, 0]
-    middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(first), 1, 1))
-    ends = data.moving[first], np.tile(middle, (len(first), 1))
-    return Signals(values, mask, *ends, turned, signals.tones, stations.position - middle), run[first]
+    heard = Snapshots.of(data, np.arange(len(data)))
+    measured = np.ones(signals.values.shape, bool) if signals.mask is None else signals.mask
+    middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
+    ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
+    array = stations.position[heard.stations] - middle
+    mask = heard.arranged(measured) != 0
+    return Signals(heard.values, mask, *ends, signals.tones, array), heard.run
 
 
 def _drawn(signals: Signals) -> np.ndarray:

@@ -200,18 +200,10 @@ class Argos(Release):
 class ArgosSim(Argos):
     """The simulated stand-in in the Argos layout: `dataset=argos_sim`; arguments as of `Argos`."""
 
-    def __init__(
-        self,
-        stand_in: StandIn,
-        antenna: int | str = 0,
-        positions: str | bool = "encoder",
-        align: bool = True,
-        encoder: Mapping[str, Any] | None = None,
-        name: str = "argos_sim",
-        batch_size: int = 16,
-    ) -> None:
-        about = {"antenna": antenna, "positions": positions, "align": align}
-        super().__init__(None, encoder, name=name, stand_in=stand_in, batch_size=batch_size, **about)
+    def __init__(self, stand_in: StandIn, root: None = None, name: str = "argos_sim", **rest: Any) -> None:
+        if root is not None:
+            raise DataError(f"dataset.root={root}: the stand-in has none; say dataset=argos for a release")
+        super().__init__(None, name=name, stand_in=stand_in, **rest)
 
     def load(self) -> Measurements:
         """As `Argos.load`, without a word about the release."""
