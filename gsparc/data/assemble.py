@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.data.blocks import blocks, contents
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
-from gsparc.data.schema import Links, Measurements, Site
+from gsparc.data.schema import Links, Measurements, Site, TrainTest
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
@@ -103,7 +103,7 @@ def assemble(
     noise_variance: np.ndarray | None = None,
     directions: list[np.ndarray] | None = None,
     row_names: list[str] | None = None,
-    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    release_split: TrainTest | None = None,
     provenance: Mapping[str, str] | None = None,
     array: np.ndarray | None = None,
     carrier_hz: float | None = None,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL
+from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
 
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
@@ -240,7 +240,7 @@ class Checker:
                 return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
         return offsets.astype(np.int64)
 
-    def release_split(self, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def release_split(self, rows: int) -> TrainTest | None:
         """(train, test) rows that the file names, or None."""
         names = self.given("split_train", "split_test")
         if len(names) == 1:

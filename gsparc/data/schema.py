@@ -26,6 +26,7 @@ End = Literal["rx", "tx"]
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
+TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,7 @@ class Measurements:
     noise_variance: np.ndarray | None = None
     directions: list[np.ndarray] | None = None
     row_names: list[str] = field(default_factory=list)
-    release_split: tuple[np.ndarray, np.ndarray] | None = None
+    release_split: TrainTest | None = None
     provenance: dict[str, str] = field(default_factory=dict)
     uplink: np.ndarray | None = None
     station: np.ndarray | None = None

@@ -20,6 +20,7 @@ from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import numbered
+from gsparc.data.schema import TrainTest
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +85,7 @@ def _are_rows(value: Any) -> bool:
     return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
 
 
+LeaveOut = Sequence[int] | Literal["outliers"]
 ROWS = Limit("outliers, or a list of rows like [3, 17],", _are_rows)
 KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*NAMES, "file"))
 
@@ -128,7 +130,7 @@ class SplitSettings(Checked):
     train_count: int | None = setting(None, or_null(whole(1)))
     thin: float = setting(1.0, number(0, 1, open_low=True))
     spacing_m: float | None = setting(None, or_null(POSITIVE))
-    leave_out: Sequence[int] | Literal["outliers"] | int = ()
+    leave_out: LeaveOut | int = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,7 +149,7 @@ class FileSettings(Checked):
 
     name: str = "file"
     path: str = ""
-    leave_out: Sequence[int] | Literal["outliers"] = setting((), ROWS)
+    leave_out: LeaveOut = setting((), ROWS)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -155,10 +157,13 @@ class FileSettings(Checked):
             raise DataError("split.path is not set; say split.path=split.json for split=file")
 
 
+AnySplit = SplitSettings | FileSettings
+
+
 def make_split(
     positions: np.ndarray,
     settings: SplitSettings,
-    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    release_split: TrainTest | None = None,
     outliers: np.ndarray | None = None,
     place: np.ndarray | None = None,
     station: np.ndarray | None = None,
@@ -198,9 +203,7 @@ def make_split(
     return Split(settings.name, folds, indices_hash(folds))
 
 
-def _pairs(
-    positions: np.ndarray, settings: SplitSettings, named: tuple[np.ndarray, np.ndarray] | None
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
     """(training, test) rows of each fold, before thinning and validation."""
     if named is not None:
         return [named]
@@ -276,9 +279,7 @@ def square_of(floor: np.ndarray, side: float) -> np.ndarray:
     return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def left_out(
-    leave_out: Sequence[int] | Literal["outliers"], outliers: np.ndarray | None, rows: int
-) -> np.ndarray:
+def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
     """The rows (n,) int64 of `rows` that `leave_out` names, where `outliers` (n,) are those of that name.
 
     Raises:
@@ -389,7 +390,7 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     return Split(name, folds, stored_hash)
 
 
-def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
     """Each fold tests on whole stretches of the path, training rows near them dropped."""
     order = path_order(positions)
     if len(order) < 2 * settings.folds * settings.stretches_per_fold:
@@ -457,7 +458,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     return tuple(folds)
 
 
-def _corner(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, np.ndarray]:
+def _corner(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
     """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
     lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
     unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 from gsparc.data.checks import outliers
 from gsparc.data.checks.coherence import coherence
 from gsparc.data.errors import some
+from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.splits import Split, SplitSettings, make_split, visits
+from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
@@ -229,9 +230,7 @@ def side_of_squares(data: Measurements) -> float | None:
 def held_out(data: Measurements, side: float) -> np.ndarray:
     """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
-        settings = SplitSettings("blocks", side_m=side)
-        where, place = data.moving - data.moving.min(axis=0), visits(data.moving, data.place)
-        split = make_split(where, settings, None, np.zeros(0, np.int64), place, data.station)
+        split = split_for({"name": "blocks", "side_m": side}, data)
         split.check()
     except ValueError:
         return np.zeros(0, np.int64)

@@ -20,7 +20,7 @@ from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.position_encoder import EncoderSettings, encoder_for
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, TrainTest
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
@@ -70,7 +70,7 @@ def load_argos(
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
-    where = _positions(root, positions, encoder, uplink, split)
+    where = _places(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -144,19 +144,13 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _positions(
-    root: Path,
-    positions: str,
-    encode: Encoder | None,
-    uplink: np.ndarray,
-    split: tuple[np.ndarray, np.ndarray] | None,
-) -> np.ndarray:
-    if positions == "true":
-        return _true_positions(root / "positions.npy", len(uplink))
-    if positions != "encoder" or encode is None:
-        raise DataError(f"dataset.positions={positions!r}: expected encoder or true")
-    rows = np.arange(len(uplink)) if split is None else split[0]
-    return encode(uplink, rows)
+def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
+    if of == "true":
+        return _true_positions(root / "positions.npy", len(up))
+    if of != "encoder" or code is None:
+        raise DataError(f"dataset.positions={of!r}: expected encoder or true")
+    rows = np.arange(len(up)) if split is None else split[0]
+    return code(up, rows)
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:

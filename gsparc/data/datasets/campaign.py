@@ -20,7 +20,7 @@ from gsparc.data.files import Several, read_text
 from gsparc.data.own import interpret
 from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import KIND_WORDS, REAL, Measurements
+from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
 from gsparc.data.selection import Selection, select
 
 log = logging.getLogger(__name__)
@@ -174,9 +174,7 @@ def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str =
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
-def read_split(
-    folder: Path, count: int | None, problems: Problems, first: int = 0
-) -> tuple[np.ndarray, np.ndarray] | None:
+def read_split(folder: Path, count: int | None, problems: Problems, first: int = 0) -> TrainTest | None:
     """(train, test) rows from 0 that `train_index.txt` and `test_index.txt` name; None where there are none.
 
     Args:

@@ -24,14 +24,13 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_csv, read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.own_checks import quaternion_to_matrix
-from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.schema import LIGHT, Measurements, TrainTest
 from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
 SPLITS = ("train", "test")
-TrainTest = tuple[np.ndarray, np.ndarray]
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 

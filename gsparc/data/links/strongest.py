@@ -42,6 +42,9 @@ def moments(place: np.ndarray, station: np.ndarray) -> np.ndarray:
     return result
 
 
+Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Lists:
     """Lists of the strongest of T stations.
@@ -87,9 +90,7 @@ class Lists:
         above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
-    def unlisted(
-        self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
         """Moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong
