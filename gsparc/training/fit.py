@@ -24,7 +24,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.training.context import FitContext
-from gsparc.training.module import GaussianModule, NetworkModule
+from gsparc.training.module import NetworkModule
 from gsparc.training.pace import SPENT, Budget
 from gsparc.training.processes import Processes
 from gsparc.training.time_budget import Spent, TimeBudget
@@ -190,8 +190,7 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    edits = isinstance(module, GaussianModule)
-    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), edits)]
+    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), module.count is not None)]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)

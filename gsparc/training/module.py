@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 import lightning.pytorch as L
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -128,20 +129,16 @@ class NetworkModule(L.LightningModule):
         # Dashboards get the seconds beside every figure too.
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
 
-    def on_validation_epoch_start(self) -> None:
-        """Begin a look."""
-        self._looks = []
-
     def on_validation_epoch_end(self) -> None:
         """Keep the errors of all rows and their figures: Lightning drops those of the look before step 1."""
-        if not self._looks:
+        looks, self._looks = self._looks, []
+        if not looks:
             return
-        self.held_out = torch.cat([errors for errors, _ in self._looks]).double().cpu()
-        share = [len(errors) / len(self.held_out) for errors, _ in self._looks]
-        every = [figures for _, figures in self._looks]
+        self.held_out = torch.cat([errors for errors, _ in looks]).double().cpu()
+        rows = [len(errors) for errors, _ in looks]
         self.figures = {
-            name: sum(part * float(one[name]) for part, one in zip(share, every, strict=True))
-            for name in every[0]
+            name: float(np.average([float(figures[name]) for _, figures in looks], weights=rows))
+            for name in looks[0][1]
         }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:

@@ -56,12 +56,6 @@ class Scene:
         return Pose(*(torch.from_numpy(one).float() for one in (self.site.static_position, turn)))
 
     @property
-    def transmitter(self) -> Tensor | None:
-        """(3,) [m], the static transmitter; None when it moves."""
-        known = self.site.static_end == "tx" and self.site.static_position is not None
-        return torch.from_numpy(self.site.static_position).float() if known else None
-
-    @property
     def reach(self) -> float:
         """Extent of the scene [m]: from the static end to the far side of the box."""
         still, (low, high) = self.site.static_position, self.box

@@ -48,10 +48,9 @@ class GsparcCheckpointIO(CheckpointIO):
 
     def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write atomically; nowhere where a fit has no folder."""
-        if Path(path).parent == Path():
-            return
         extra = {"trainer": trainer_state, **self.marks}
-        checkpoint.save(Path(path), self.method, self.config_yaml, extra)
+        if Path(path).parent != Path():
+            checkpoint.save(Path(path), self.method, self.config_yaml, extra)
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
