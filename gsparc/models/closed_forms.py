@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -26,20 +25,15 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
-from gsparc.models.conditional import ConditionalField
-from gsparc.models.fields import INITIALISERS, restored, stored
-from gsparc.models.method import HasPaths, Method, Prediction
-from gsparc.models.mixture import solutions
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Blended, contributions, knobs, reduced
+from gsparc.models.reduced import contributions, knobs, reduced
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, no_array, no_phase
-from gsparc.processes.posterior import approximated
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -63,7 +57,7 @@ class ClosedForms(LearnsTogether):
     has_gaussians = True
     resumable = True
     stored_names: ClassVar[dict[str, str]] = {"position_std": ""}
-    field: ConditionalField  # after `fit` or `restore`
+    solution: Mixture  # after `fit` or `restore`
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
@@ -72,14 +66,11 @@ class ClosedForms(LearnsTogether):
         check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
         self.switches, self.position_std, self.init = effects, position_std, init or InitSettings()
         self.residual_alone = residual_alone
-        self.explained: float | None = None
-        self.init_s: float | None = None
-        self.started = ""  # initialisers of what was fitted
         self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
 
     @abstractmethod
     def parts(self, data: Measurements) -> tuple[str, ...]:
-        """Names of initialisers (`gsparc.models.fields.INITIALISERS`), weighed where they are several."""
+        """Names of candidates (`gsparc.models.mixture.candidates`), weighed where they are several."""
 
     @abstractmethod
     def obstacle(self, data: Measurements) -> str | None:
@@ -93,13 +84,13 @@ class ClosedForms(LearnsTogether):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        process = getattr(self.field, "process", None)
-        return approximated(self.name, getattr(process, "posterior", None))
+        inner = self.solution.only if hasattr(self, "solution") else None
+        return self.name if inner is None else inner.label.replace(inner.name, self.name, 1)
 
     @property
     def effects(self) -> str:  # type: ignore[override]
         """The terms that are computed, for `summary.json`."""
-        return "+".join(self.field.terms) or "residual"
+        return "+".join(self.solution.terms) or "residual"
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -134,7 +125,7 @@ class ClosedForms(LearnsTogether):
         budget = context.time_budget()
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refined(self.field, self.runs.aligned(data), std)
+        rows, by, note = refined(self.solution, self.runs.aligned(data), std)
         if by.any() and budget.over():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -151,67 +142,41 @@ class ClosedForms(LearnsTogether):
     def _solve(
         self, parts: tuple[str, ...], init: InitSettings, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        """Fit initialisers `parts`, which have settings `init`, and weigh them.
-
-        Raises:
-            ValueError: the only initialiser, or the one asked for, cannot solve this.
-        """
-        budget = context.time_budget()
-        end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
-        log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
-        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
-        cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
-        self.runs = _runs(data, known, init, context)
-        data = self.runs.aligned(data)
-        fields, reports, read = solutions.find(parts, init, self.switches, data, fold, context, budget, cut)
-        members = solutions.weighed(fields, data, fold, cut)
-        heeded.count(*(path for name in members for path in read[name]))
-        self.field, self.started = field, _ = solutions.joined(members), "+".join(members)
-        field.site = data.site
-        self.init_s = budget.counted.wall
-        log.info(
-            "%s of %d Gaussians from init=%s, terms %s", type(field).__name__, field.count,
-            self.started, ", ".join(field.terms) or "none",
-        )  # fmt: skip
-        self.explained = _explained(field, data, fold, several)
-        if several or self.explained is not None:  # else it is of these rows already
-            field.condition(data, known)
-        seconds = budget.counted.wall
-        if several:
-            context.curve(seconds, "final")
-        stages = {name: report.seconds for name, report in reports.items()}
-        stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
-        stages["final weights"] = seconds - self.init_s
-        unused = {name: spent for name, spent in stages.items() if name in reports and name not in members}
-        notes = [note for name in members for note in reports[name].notes]
-        limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited).costing(Cost(stages, unused))
+        """Fit and weigh candidates `parts`, of channels of several runs in the phase and level of one."""
+        budget, known = context.time_budget(), np.sort(np.concatenate([fold.train, fold.val]))
+        self.runs, self.solution = _runs(data, known, context), Mixture(parts, init, self.switches)
+        aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
+        report = self.solution.fit(self.runs.aligned(data), fold, replace(context, budget_s=budget.left_s))
+        if not aligning:
+            return report
+        cost = Cost({"factors of runs": aligning}) + report.cost
+        return replace(report, seconds=report.seconds + aligning, cost=cost)
 
     # -- answering ---------------------------------------------------------------------------------
 
     def objects(self) -> SiteObjects:
         """Those of the field with closed-form weights."""
-        return self.field.objects()
+        return self.solution.objects()
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        if not hasattr(self, "field"):
+        if not hasattr(self, "solution"):
             raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
-        told = Prediction.joined([self.field(part) for part in query.split(QUERY_CHUNK)])
+        told = Prediction.joined([self.solution.predict(part) for part in query.split(QUERY_CHUNK)])
         return self.runs.restored(told, query.run)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        result = getattr(self.field, "process", None)
-        return None if result is None else result.exact()
+        inner = self.solution.only
+        return inner.process() if isinstance(inner, HasProcess) else None
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
-        if not self.field.forgets:
+        if not self.solution.forgets:
             return None
         result = copy.copy(self)
-        result.field = copy.deepcopy(self.field)
-        result.field.condition(data, rows)
+        result.solution = copy.deepcopy(self.solution)
+        result.solution.condition(data, rows)
         return result
 
     def gradient_problem(self) -> str | None:
@@ -223,8 +188,7 @@ class ClosedForms(LearnsTogether):
 
         What other solutions and the residual add to channels is in no path.
         """
-        methods = [(weight, getattr(one, "method", None)) for weight, one in self.field.parts()]
-        made = [(weight, method) for weight, method in methods if isinstance(method, HasPaths)]
+        made = [(weight, one) for weight, one in self.solution.parts() if isinstance(one, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
         result = [(weight, method.paths(query)) for weight, method in made]
@@ -232,87 +196,59 @@ class ClosedForms(LearnsTogether):
         delay = torch.cat([one[1] for _, one in result], dim=2)
         return gain, delay, torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
 
-    def _method(self) -> Method | None:
-        """The method inside the only solution, where there is one."""
-        parts = [*self.field.parts()]
-        return getattr(parts[0][1], "method", None) if len(parts) == 1 else None
-
     # -- reductions --------------------------------------------------------------------------------
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        method = self._method()
-        return () if method is None else knobs(method)
+        return () if self.solution.only is None else knobs(self.solution.only)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
-        method = self._method()
-        return {} if method is None else contributions(method, data, rows)
+        inner = self.solution.only
+        return {} if inner is None else contributions(inner, data, rows)
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        method, whole = self._method(), self.field
-        if method is None:
-            return self
-        result = reduced(method, settings, measured)
-        if isinstance(whole, Mixture) and whole.residual is not None:
-            return Blended(result, whole.residual, whole.share)
-        return result
+        inner = self.solution.only
+        return self if inner is None or not knobs(inner) else reduced(inner, settings, measured)
 
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Field, and what was found out."""
-        return {
-            "field": stored(self.field), "facts": {"explained": self.explained}, "init": self.started,
-            "runs": self.runs.state(),
-        }  # fmt: skip
+        """See `Method.state`."""
+        return {"solution": self.solution.state(), "runs": self.runs.state()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.field = site, restored(site, state["field"])
-        self.explained = state["facts"]["explained"]
-        self.started, self.runs = str(state["init"]), RunFactors.read(state["runs"])
+        self.site, self.runs, self.solution = site, RunFactors.read(state["runs"]), Mixture()
+        self.solution.restore(site, state["solution"])
 
     def size(self) -> int:
         """Number of Gaussians."""
-        return self.field.count
+        return self.solution.count
 
     @property
     def made(self) -> str:
         """See `Method`."""
-        terms = ", ".join(self.field.terms) or "a process alone"
-        return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
+        terms = ", ".join(self.solution.terms) or "a process alone"
+        return f"{self.solution.started.replace('+', ' + ')} in closed form: {terms}"
 
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""
         return super().facts() | {
-            "model/init": self.started, "model/variance_explained": self.explained, "model/steps": 0,
-            "model/steps_taken": 0, "time/init_s": self.init_s,
+            "model/init": self.solution.started, "model/variance_explained": self.solution.explained,
+            "model/steps": 0, "model/steps_taken": 0, "time/init_s": self.solution.init_s,
         }  # fmt: skip
 
 
-def _runs(data: Measurements, known: np.ndarray, init: InitSettings, context: FitContext) -> RunFactors:
+def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
     """Factors of several runs of channels, by the waves that explain rows (n,); else none."""
     if not RunFactors.several(data, known):
         return RunFactors.none()
-    field, _ = INITIALISERS["diffuse"](data, known, init, True, context)
-    assert isinstance(field, ChannelField)
-    log.info("channels of %d runs: the factor of each was estimated with the waves' field", len(field.runs))
-    return field.runs
-
-
-def _explained(field: ConditionalField, data: Measurements, fold: Fold, apart: bool) -> float | None:
-    """See `Solved`; leaves the field conditioned on training rows, as it is already where `apart`."""
-    if not (len(fold.val) and field.count):
-        return None
-    if not apart:
-        field.condition(data, fold.train)
-    batch = data.batch(fold.val)
-    result = field(batch).explained
-    assert result is not None
-    own, target = (comparable(one, data.site) for one in (result, batch.target))
-    return explained(own, target, data.site.kind != "csi")
+    waves = ChannelField()
+    waves.fit(data, Fold(known, known[:0], known[:0]), context)
+    log.info("channels of %d runs: the factor of each was estimated with the waves' field", len(waves.runs))
+    return waves.runs
 
 
 class ImageSources(ClosedForms):

@@ -120,7 +120,7 @@ class Gsparc(LearnsTogether):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        solved = state.get("field") is not None  # a field in closed form says itself what it is
+        solved = "solution" in state  # a field in closed form says itself what it is
         self.site, self.chosen = site, Channels() if solved else self.rendered
         self.chosen.name = self.name
         self.chosen.restore(site, state)
@@ -139,7 +139,7 @@ class Gsparc(LearnsTogether):
     threads_pay = _its("threads_pay")
     gradient_problem = _its("gradient_problem")
     field_alone = _its("field_alone")
-    field = _its("field")
+    solution = _its("solution")
     fitted = _its("fitted")
     steps = _its("steps")
     steps_taken = _its("steps_taken")
