@@ -23,6 +23,7 @@ MOST_BINS = 8
 PARTS = 5  # of blocks, that are calibrated without by turns
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
+COMPLETED = 100  # passes over censored rows
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
 
 
@@ -56,14 +57,8 @@ class Evidence:
 
     @property
     def error(self) -> np.ndarray:
-        """Measured less predicted (n,), in deviations; of censored rows the least it can be in size."""
-        error = (self.level_db - self.mean_db) / self.spread_db
-        return np.where(self.side != 0, self.side * np.minimum(self.side * error, 0.0), error)
-
-    @property
-    def informative(self) -> np.ndarray:
-        """Rows (n,) bool that bound an error: measured, or predicted on the wrong side of their level."""
-        return (self.side == 0) | (self.side * (self.level_db - self.mean_db) < 0)
+        """Measured less predicted (n,), in deviations; of censored rows what bounds it."""
+        return (self.level_db - self.mean_db) / self.spread_db
 
     def state(self) -> dict[str, Any]:
         """For the `extra` of a checkpoint."""
@@ -105,7 +100,7 @@ class Calibration:
         """Root mean square error (n,) [dB]; NaN out of reach."""
         return self._of(self.rms, spread_db, distance, station)
 
-    def below(self, level_db: float, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
+    def below(self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
         """Probability (n,) that a measurement lies below a level; NaN where it is not known."""
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
@@ -131,43 +126,84 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     Raises:
         ValueError: too few rows.
     """
-    used = evidence.at(np.flatnonzero(evidence.informative & np.isfinite(evidence.error)))
-    if len(used) < LEAST_ROWS:
+    used = evidence.at(np.flatnonzero(np.isfinite(evidence.error)))
+    heard = used.side == 0
+    if heard.sum() < LEAST_ROWS:
         raise ValueError(
-            f"{len(used)} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"
+            f"{heard.sum()} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"
         )
     blocks = len(np.unique(used.block))
     level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
     station = _of_stations(used, level)
     used = replace(used, spread_db=used.spread_db * station[used.station])
-    order = np.argsort(used.distance, kind="stable")
-    count = int(np.clip(min(len(used) // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
-    bins = [used.at(rows) for rows in np.array_split(order, count)]
-    size = np.abs(used.error)
+    count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
+    first = [float(part[0]) for part in np.array_split(np.sort(used.distance[heard]), count)[1:]]
+    which = np.searchsorted(first, used.distance, side="right")
+    bins = [used.at(np.flatnonzero(which == number)) for number in range(count)]
     middle = np.array([float(np.median(one.distance)) for one in bins])
-    half = np.array([float(np.quantile(np.abs(one.error), level)) for one in bins])
-    rms = np.array([float(np.sqrt(np.mean(one.error**2))) for one in bins])
+    spreads = [completed(one) for one in bins]
+    half = np.array([quantiles(np.abs(error), mass, level) for error, mass in spreads])
+    rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
     typical = np.array([float(np.median(one.spread_db)) for one in bins])
     weight = np.array([len(one) for one in bins], float)
     half, rms = (_rising(middle, one * typical, weight) / typical for one in (half, rms))
     tail = None
-    if not evidence.side.any():
-        standard = used.error / np.interp(used.distance, middle, rms)
-        tail = np.quantile(standard, TAIL)
-        tail = tail + np.arange(len(tail)) * 1e-9 * max(float(size.max()), 1.0)  # no two are equal
+    if heard.all():
+        tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
+        apart = 1e-9 * max(float(np.abs(used.error).max()), 1.0)
+        tail = tail + np.arange(len(tail)) * apart  # no two are equal
     return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)), station)
+
+
+def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (m,) in deviations and their masses, those of censored rows spread over the errors they allow.
+
+    The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
+    no measured error counts as the least that its own can be in size.
+    """
+    bound, side = evidence.error, evidence.side.astype(np.int64)
+    order = np.argsort(bound, kind="stable")
+    bound, side = bound[order], side[order]
+    heard = bound[side == 0]
+    low, high = heard[[0, -1]] if len(heard) else (np.inf, -np.inf)
+    alone = ((side > 0) & (bound < low)) | ((side < 0) & (bound > high))
+    error = np.where(alone, side * np.minimum(side * bound, 0.0), bound)
+    exact = np.sort(error[(side == 0) | alone])
+    below = np.searchsorted(exact, bound[(side > 0) & ~alone], side="right")
+    above = np.searchsorted(exact, bound[(side < 0) & ~alone], side="left")
+    mass = np.full(len(exact), 1 / len(exact))
+    for _ in range(COMPLETED if len(below) + len(above) else 0):
+        total = np.r_[0.0, np.cumsum(mass)]
+        share = np.zeros(len(exact) + 1)
+        np.add.at(share, below, 1 / total[below])
+        shared = np.cumsum(share[::-1])[::-1][1:]  # an error takes its part of all rows that allow it
+        share[:] = 0.0
+        np.add.at(share, above, 1 / (total[-1] - total[above]).clip(np.finfo(float).tiny))
+        mass = (1 + mass * (shared + np.cumsum(share)[:-1])) / len(bound)
+    return exact, mass
+
+
+def quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+    """Of values (n,) with masses (n,), those below which lie such shares; of equal ones as `np.quantile`."""
+    order = np.argsort(values, kind="stable")
+    before = np.cumsum(mass[order]) - mass[order]
+    return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
 
 
 def _of_stations(used: Evidence, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
-    size = np.abs(used.error)
-    whole = float(np.quantile(size, level))
+
+    def typical(part: Evidence) -> float:
+        error, mass = completed(part)
+        return float(quantiles(np.abs(error), mass, level))
+
+    whole = typical(used)
     factors = np.ones(int(used.station.max()) + 1)
     for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
-        own = used.station == number
-        if own.sum() >= LEAST_ROWS:
-            blocks = len(np.unique(used.block[own]))
-            ratio = max(float(np.quantile(size[own], level)), 1e-3 * whole) / whole
+        own = used.at(np.flatnonzero(used.station == number))
+        if (own.side == 0).sum() >= LEAST_ROWS:
+            blocks = len(np.unique(own.block))
+            ratio = max(typical(own), 1e-3 * whole) / whole
             factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
     return factors
 
@@ -179,13 +215,25 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
 
 
 def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (n,) bool whose measurement lies in the interval, and widths (n,) [dB], NaN where nothing is said.
+    """Chances (n,) that a measurement lies in its interval, and widths (n,) [dB], NaN where nothing is said.
 
-    A censored row is in an interval that reaches beyond its level.
+    Of what was measured they are 0 or 1; a censored row's is that of the errors which its level allows.
     """
     half = calibration.interval(evidence.spread_db, evidence.distance, evidence.station)
-    inside = np.abs(evidence.error * evidence.spread_db) <= half
-    return inside & np.isfinite(half), 2 * half
+    return _inside(calibration, evidence, half), 2 * half
+
+
+def _inside(calibration: Calibration, evidence: Evidence, half: np.ndarray) -> np.ndarray:
+    side, mean = evidence.side, evidence.mean_db
+    expected = calibration.expected_error(evidence.spread_db, evidence.distance, evidence.station)
+    low, high, bound = (
+        calibration.below(level, mean, expected) for level in (mean - half, mean + half, evidence.level_db)
+    )
+    allowed = np.where(side > 0, bound, 1 - bound)
+    both = np.where(side > 0, np.minimum(high, bound) - low, high - np.maximum(low, bound))
+    chance = np.clip(np.divide(both, allowed, out=np.zeros_like(both), where=allowed > 0), 0.0, 1.0)
+    measured = np.abs(evidence.level_db - mean) <= half
+    return np.where(np.isfinite(half), np.where(side == 0, measured, chance), 0.0)
 
 
 @dataclass(frozen=True)
@@ -216,16 +264,17 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
-    inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
+    inside, own, width = (np.full(len(evidence), fill) for fill in (0.0, 0.0, np.nan))
+    half = float(norm.ppf((1 + share) / 2)) * evidence.spread_db
     for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
-        inside[tried], width[tried] = covered(calibrate(evidence.at(rest), share), evidence.at(tried))
+        calibration, own_part = calibrate(evidence.at(rest), share), evidence.at(tried)
+        inside[tried], width[tried] = covered(calibration, own_part)
+        own[tried] = _inside(calibration, own_part, half[tried])
     known = np.isfinite(width)
-    half = float(norm.ppf((1 + share) / 2))
-    own = np.abs(evidence.error) <= half
     return Coverage(
         float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
-        len(blocks), float(own[known].mean()), float(2 * half * evidence.spread_db[known].mean()),
+        len(blocks), float(own[known].mean()), float(2 * half[known].mean()),
         *(float(inside[part].mean()) if part.any() else np.nan
           for part in (known & (evidence.side == 0), known & (evidence.side != 0))),
     )  # fmt: skip

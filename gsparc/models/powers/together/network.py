@@ -20,7 +20,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import LinkRows
-from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.censored import ConditionalGaussian, Sites, propagate
 from gsparc.processes.density import Evidence, walked
 from gsparc.processes.factor import Factor
 from gsparc.processes.prior import Prior
@@ -225,6 +225,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
     own = [rough.terms(at) * rough.unit for at in places]
     bands, count = len(rough.levels), sum(len(part.index) for part in parts)
+    last: list[list[Sites]] = [[] for _ in parts]
     kinds = own[0].shape[1] // (int(rough.rank.max()) + 1)
     is_gain = torch.arange(own[0].shape[1]) % kinds == 0
 
@@ -242,7 +243,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
         total = _off(shared) + 0.5 * ((at[-7:] - usual[-7:]) / loose[-7:]).square().sum()
         for i, at_ in enumerate(places):
             rest = values[i] - rough.at(at_, shared, levels)
-            total = total + Evidence.apply(covariance(i, at), rest, side[i])  # type: ignore[no-untyped-call]
+            total = total + Evidence.apply(covariance(i, at), rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
     middle = float(np.median(pairs[0].distance.numpy())) or 1.0
