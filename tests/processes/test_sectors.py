@@ -46,7 +46,7 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
         decades = trend.law.decades(places).numpy() - 2
         loss = pattern(
             at, np.tile(here, (2, 1)), table[:, 0] + change.get("azimuth", 0),
-            table[:, 1] + 0.5 + change.get("tilt", 0), table[:, 2] * np.exp(0.1), table[:, 3] * np.exp(-0.05), 25.0,
+            table[:, 1] + 0.5 + change.get("tilt", 0), *(table[:, 2:4] * np.exp([0.1, -0.05])).T, 25.0,
         )[np.arange(40), number]  # fmt: skip
         own = np.array([-50.0, -44])[number] + table[number, 4]
         return own - 10 * (3.2 + change.get("exponent", 0)) * decades - bend * decades**2 + loss
