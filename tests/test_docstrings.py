@@ -9,14 +9,16 @@ import pytest
 import torch
 
 import gsparc
-import gsparc.maps
+import gsparc.apps.locate
+import gsparc.apps.maps
 
 RNG = np.random.default_rng(0)
 PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.5)]
 ENDS = np.array([[4.0, 4.0, 2.6], [9.0, 9.0, 2.6]])
 POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
 PUBLIC = {name: getattr(gsparc, name) for name in gsparc.__all__}
-MAPS = {name: getattr(gsparc.maps, name) for name in ("map_of", "plan_next")}
+APPS = {name: getattr(gsparc.apps.maps, name) for name in ("map_of", "plan_next")}
+APPS |= {"locate": gsparc.apps.locate.locate}
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +39,12 @@ def examples(of: object, name: str) -> list[doctest.DocTest]:
     return [test for test in found if test.examples]
 
 
-@pytest.mark.parametrize("name", PUBLIC | MAPS)
+@pytest.mark.parametrize("name", PUBLIC | APPS)
 def test_examples_of_docstrings_run(name, checkpoints, monkeypatch):
     monkeypatch.chdir(checkpoints)
     known = (
         PUBLIC
-        | MAPS
+        | APPS
         | {
             "gsparc": gsparc,
             "torch": torch,
@@ -51,7 +53,7 @@ def test_examples_of_docstrings_run(name, checkpoints, monkeypatch):
             "powers_dbm": POWERS[:, 0],
         }
     )
-    tests = examples((PUBLIC | MAPS)[name], name)
+    tests = examples((PUBLIC | APPS)[name], name)
     assert tests, f"{name} has no example"
     report: list[str] = []
     for test in tests:

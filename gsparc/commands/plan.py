@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.pictures import draw_plan_picture
+from gsparc.apps.maps.planning import plan_next
+from gsparc.apps.maps.promised import promise_of
 from gsparc.commands.map import settings_of, stations_of
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import plain
 from gsparc.evaluation.summary import write_samples
-from gsparc.maps.floor_plan import plan_of
-from gsparc.maps.pictures import draw_plan_picture
-from gsparc.maps.planning import plan_next
-from gsparc.maps.promised import promise_of
 from gsparc.prediction.operating_point import load
 
 

@@ -1,8 +1,8 @@
-"""Terms of a field: their switches, which of them mean something at a site, and what a plan of them is."""
+"""Terms of a field: their switches, and which of them mean something at a site."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from gsparc.data.limits import Checked, setting, switch
@@ -38,27 +38,6 @@ class EffectSettings(Checked):
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is trained.
-
-    Attributes:
-        rasterized: whether Gaussians are rendered; else weights are in closed form.
-        array: of rasterized ones, whether through the static array.
-        parts: initialisers of conditional fields, weighed against each other where there are several.
-        plain: of rasterized ones, whether a plain process on the target may stand in, or be averaged in.
-        reasons: one line each.
-        options: that decided, by their paths; others may be heeded by what is trained.
-    """
-
-    rasterized: bool
-    array: bool = False
-    parts: tuple[str, ...] = ()
-    plain: bool = False
-    reasons: tuple[str, ...] = field(default=())
-    options: tuple[str, ...] = field(default=())
-
-
-@dataclass(frozen=True)
 class Terms:
     """Which terms are on.
 
@@ -83,7 +62,7 @@ class Terms:
 def called_for(
     switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
 ) -> Terms:
-    """The terms that mean something here and are not switched off; see `gsparc.plan`.
+    """The terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
 
     `distant`: whether emissions fall with the distance, which makes them no linear read-out of an array.
 
@@ -96,12 +75,12 @@ def called_for(
     request = networks or placed  # asks for Gaussians that are rendered
     distance = distant and init.name != "vectors"
     obstacles = {
-        "array": _no_array(site, "rx", "the receiver moves")
+        "array": no_array(site, "rx", "the receiver moves")
         or (networks and f"{networks} asks for networks")
         or ("attenuation.inverse_distance=true leaves no linear read-out" if distance else None),
-        "moving_array": _no_array(site, "tx", "the receiver stands still")
+        "moving_array": no_array(site, "tx", "the receiver stands still")
         or (request and f"{request} asks for rendered Gaussians"),
-        "phase": _no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
+        "phase": no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
     on, reasons, options = {}, [], [] if site.kind == "rssi" else ["model.effects.residual"]
@@ -150,8 +129,8 @@ def _refuse_scene(
         raise ValueError(f"init=scene is not possible: {why}")
 
 
-def _no_array(site: Site, static_end: str, otherwise: str) -> str | None:
-    """Why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
+def no_array(site: Site, static_end: str, otherwise: str) -> str | None:
+    """Say why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
     if site.kind != "spectrum":
         return f"the target is {site.kind}, not a spectrum"
     if site.static_end != static_end:
@@ -161,7 +140,8 @@ def _no_array(site: Site, static_end: str, otherwise: str) -> str | None:
     return None
 
 
-def _no_phase(data: Measurements) -> str | None:
+def no_phase(data: Measurements) -> str | None:
+    """Say why channels have no carrier phase that tells of places; None where they have."""
     site = data.site
     if site.kind != "csi":
         return f"the target is {site.kind}, which carries no phase"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudge
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
+
+log = logging.getLogger(__name__)
 
 StationModels = Literal["auto", "each", "together"]
 
@@ -38,6 +41,11 @@ class FitReport:
     notes: tuple[str, ...] = ()
     limited_by: Clock | None = None
     cost: Cost = NO_COST
+
+    def costing(self, cost: Cost) -> FitReport:
+        """Return the report with its stages, which are logged."""
+        log.info("cost: %s", cost.described(self.limited_by))
+        return replace(self, cost=cost)
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def test_options_of_the_trainer_need_no_plus(option):
 
 def test_the_paper_leaves_nothing_to_auto():
     config = compose("paper=gsparc")
-    settings = build(config.model).settings
+    settings = build(config.model).rendered.settings
     values = [config.init.name, settings.emission.activation, settings.emission.encoding.kind]
     assert "auto" not in [*values, settings.emission.init_bias, *config.model.effects.values()]
     assert len(config.model.guesses) > 5

@@ -17,8 +17,8 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
+from gsparc.apps.maps import map_of
 from gsparc.commands.listing import COMMANDS
-from gsparc.maps import map_of
 
 
 def run(command, *settings, folder):

@@ -90,13 +90,10 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(tmp_path):
     bad = int(fold.train[4])
     target[bad, 3, 3] = np.nan
     method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model)
-    method.settings = dataclasses.replace(
-        method.settings,
-        emission=dataclasses.replace(
-            method.settings.emission,
-            encoding=dataclasses.replace(method.settings.emission.encoding, kind="raw"),
-        ),
-    )
+    settings = method.rendered.settings
+    encoding = dataclasses.replace(settings.emission.encoding, kind="raw")
+    emission = dataclasses.replace(settings.emission, encoding=encoding)
+    method.rendered.settings = dataclasses.replace(settings, emission=emission)
     with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
         method.fit(dataclasses.replace(data, target=target), fold, short(tmp_path, 20))
     assert (tmp_path / "nonfinite.pt").exists()

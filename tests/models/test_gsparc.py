@@ -21,14 +21,15 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, fields, loading
+from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
-from gsparc.models.mixture import solutions
+from gsparc.models.mixture import residual, solutions
 from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.registry import build, method_class
+from gsparc.models.splat.averaged import ImageProcess
 from gsparc.ops import Pose
 from gsparc.training import race
 from gsparc.training.context import FitReport
@@ -67,8 +68,11 @@ class Kept(logging.Handler):
         self.lines.append(record.getMessage())
 
 
-def fit(name: str, *overrides: str, budget_s: float | None = None, steps: int = 12, **more: str) -> Fitted:
-    folder, config = Path(mkdtemp()), compose(*SMALL, *overrides)
+def fit(
+    name: str, *overrides: str, budget_s: float | None = None, steps: int = 12,
+    small: tuple[str, ...] = SMALL, **more: str,
+) -> Fitted:  # fmt: skip
+    folder, config = Path(mkdtemp()), compose(*small, *overrides)
     data = KINDS[name](folder)
     fold = fold_of(data)
     method = for_links(lambda: build(config.model), data)
@@ -128,6 +132,31 @@ def test_a_checkpoint_says_the_same(name, tmp_path):
     assert again.size() == fitted.method.size() and again.effects == fitted.method.effects
 
 
+@pytest.mark.parametrize(
+    ("name", "named"),
+    [
+        ("images", "image_process"), ("static array", "array_process"), ("moving array", "bearings"),
+        ("channels", "image_sources"), ("channels from nowhere known", "channels"), ("powers", "powers"),
+    ],
+)  # fmt: skip
+def test_what_is_chosen_answers_the_same_by_its_own_name(name, named):
+    brief = "init.searches=1", "init.search_rows=60", "init.max_sources=4"
+    gaussians = () if name not in ("images", "static array") else ("model.field.count=40",)
+    both = [
+        fit(name, f"model={model}", *brief, *gaussians, small=(), budget_s=1e3) for model in ("gsparc", named)
+    ]
+    assert f"gsparc is model={named} here" in both[0].lines
+    facts = [one.method.facts() | {"model/made": "", "time/init_s": None} for one in both]
+    assert facts[0] == facts[1]
+    same(both[0].method, both[1].method, asked(both[0]))
+
+
+@pytest.mark.parametrize("named", ["image_sources", "channels", "bearings", "array_process"])
+def test_a_method_of_another_kind_of_measurement_is_refused(named):
+    with pytest.raises(ValueError, match=f"{named}: the target is rssi"):
+        fit("powers", f"model={named}", small=())
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_far_from_all_data_nothing_is_known(name):
     fitted = default(name)
@@ -160,9 +189,10 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     fitted = default(name)
     first = next(line for line in fitted.lines if line.startswith("training "))
     before = fitted.lines[: fitted.lines.index(first)]
-    assert all(line.startswith(("effects.", "the residual is all there is")) for line in before)
+    assert all(line.startswith(("effects.", "the residual is all there is")) for line in before[:-1])
+    assert before[-1].startswith("gsparc is model=")
     init = "+".join(part for part in first.partition("init=")[2].split(",")[:1])
-    assert ("by rendering" in first) == (fitted.method.field is None) and init
+    assert ("by rendering" in first) == isinstance(fitted.method.chosen, ImageProcess) and init
     assert ("callbacks" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
@@ -185,22 +215,23 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
-    monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
+    monkeypatch.setattr(residual, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(race, "HOPELESS", math.inf)
     monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
-    field = fitted.method.field
-    assert isinstance(field, Mixture) and sum(field.weights) == pytest.approx(1)
-    assert [isinstance(member, Mixture) for member in field.members] == [False, True, True]
+    field = fitted.method.solution
+    assert sum(field.weights) == pytest.approx(1)
+    completed = [isinstance(member, Residual) and member.rest is not None for member in field.members]
+    assert completed == [False, True, True]
     assert fitted.method.facts()["model/init"] == "diffuse+few sources+sources" and field.count
     assert {"phase", "residual"} <= set(fitted.method.effects.split("+"))
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert isinstance(again.field, Mixture) and again.field.weights == field.weights
+    assert again.solution.weights == field.weights
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
-    again.field.condition(fitted.data, rows)  # the same rows, the same weights
+    again.solution.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
     one, two = (m.predict(batch).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
@@ -242,13 +273,13 @@ def test_without_the_residual_gaussians_are_alone(name):
     fitted = fit(name, "model.effects.residual=false")
     method = fitted.method
     assert "residual" not in method.effects and method.size() > 0
-    if method.field is None:
+    if isinstance(method.chosen, ImageProcess):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
-    found = method.field(batch)
+    found = method.solution.predict(batch)
     torch.testing.assert_close(found.mean, found.explained)
-    assert not isinstance(method.field, Mixture)
+    assert not isinstance(method.solution.only, Residual)
 
 
 @pytest.mark.parametrize(
@@ -287,7 +318,7 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
     given = []
     initialiser = lambda *args: given.append(args[-1].budget_s) or 1 / 0  # noqa: E731
-    monkeypatch.setattr(solutions, "INITIALISERS", {"powers": initialiser})
+    monkeypatch.setattr(solutions, "CANDIDATES", {"powers": initialiser})
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):

@@ -53,10 +53,12 @@ DECLARED = {
     "splat": "Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
-    "gsparc": "HasPaths Reducible",
+    **dict.fromkeys(("array_process", "image_process"), "Reducible"),
+    **dict.fromkeys(("gsparc", "image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
 }
+NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
-GRADIENTS += ("moving_array", "splat", "gsparc")  # see tests/prediction/test_gradients.py
+GRADIENTS += ("moving_array", "splat", "gsparc", *NAMED)  # see tests/prediction/test_gradients.py
 VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
@@ -94,7 +96,10 @@ def data_of(name: str, folder: Path) -> Measurements:
         return room(40, directions=True)[0] if name in ("ngrf", "newrf") else lobes(folder)[0]
     if name in UPLINK:
         return city("all")
-    make = {"gp": kinds.images, "complex_gp": kinds.gains}.get(name, kinds.received)
+    make = {
+        "gp": kinds.images, "complex_gp": kinds.gains, "channels": kinds.gains, "image_sources": kinds.gains,
+        "array_process": kinds.static_array, "image_process": kinds.images, "bearings": kinds.moving_array,
+    }.get(name, kinds.received)  # fmt: skip
     return make(folder)
 
 
@@ -108,6 +113,9 @@ def unfitted(name: str) -> Method:
         return ImageSourceGP(searches=1, search_rows=60, clutter=False)
     if name == "array":
         return ArrayField(FieldSettings(count=64))
+    if name in NAMED:
+        few = ("init.searches=1", "init.search_rows=60", "init.max_sources=4")
+        return build(compose(f"model={name}", *few).model)
     if name == "moving_array":
         search = SearchSettings(sources=8, rows=30, candidates=1000, steps=20)
         return MovingArrayField(search=search, components=32)
@@ -147,7 +155,7 @@ def test_a_method_is_what_the_table_says(name):
     method = method_class(name)()
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in ("image_source_gp", "splat", "gsparc"))
+    assert method.resumable == (name in ("image_source_gp", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
@@ -244,7 +252,7 @@ def test_places_are_served_in_the_phase_of_the_largest_run(words):
     fold, method = fold_of(data), build(compose(*words.split()).model)
     method.fit(data, fold, FitContext())
     batch = data.batch(fold.test)
-    factor = method.runs.of(batch.run)[:, None, None]
+    factor = getattr(method, "chosen", method).runs.of(batch.run)[:, None, None]
     assert (factor - 1).abs().max() > 0.1
     said = served(Predictor(method, data.site), data, fold.test)
     torch.testing.assert_close(said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5)

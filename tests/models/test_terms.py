@@ -9,8 +9,12 @@ from invented import invent
 from known_arrays import array_site
 
 from gsparc.data.datasets.rfid import planar_array
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
-from gsparc.models.gsparc import plan
+from gsparc.field.model import AttenuationSettings
+from gsparc.models.closed_forms import ClosedForms
+from gsparc.models.gsparc import Gsparc, choose
 from gsparc.models.terms import EffectSettings
 from gsparc.ops import SphereGrid
 
@@ -25,8 +29,16 @@ def measured(kind: str):
     return replace(invent("spectrum", 20), site=site)
 
 
-def planned(kind: str, effects=(), init="auto", hidden=0, count=1):
-    return plan(EffectSettings(**dict(effects)), InitSettings(init), measured(kind), hidden, count)
+def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
+    """The parts of what is in closed form, and whether an array is seen through."""
+    data = measured(kind)
+    settings = Gsparc(
+        EffectSettings(**dict(effects)), init=InitSettings(init), emission=EmissionSettings(hidden=hidden),
+        field=FieldSettings(count=count), **more,
+    )  # fmt: skip
+    found = choose(data, settings)
+    parts = found.parts(data) if isinstance(found, ClosedForms) else ()
+    return parts, not parts and found.settings.response.array
 
 
 @pytest.mark.parametrize(
@@ -49,25 +61,24 @@ def planned(kind: str, effects=(), init="auto", hidden=0, count=1):
         ("moving array", {"effects": {"residual": False}}, ("bearings",)),
     ],
 )
-def test_what_a_site_calls_for(kind, given, parts):
-    found = planned(kind, **given)
-    assert found.parts == parts and found.rasterized == (not parts)
-    assert found.array == (kind == "array")
-    assert kind != "unplaced csi" or "does not say where the static end is" in found.reasons[-1]
+def test_what_a_site_calls_for(kind, given, parts, caplog):
+    caplog.set_level("INFO", "gsparc")
+    assert chosen(kind, **given) == (parts, kind == "array")
+    assert kind != "unplaced csi" or "does not say where the static end is" in caplog.messages[-1]
 
 
-def test_inverse_distance_was_refused_with_advice_that_undid_it():
+def test_inverse_distance_was_refused_with_advice_that_undid_it(caplog):
     """With an array that is `auto` the Gaussians emit powers; one that was asked for stays an error."""
-    data, said = measured("array"), (0, 1, True)
-    found = plan(EffectSettings(), InitSettings(), data, *said)
-    assert found.rasterized and not found.array
-    assert "effects.array -> off: attenuation.inverse_distance=true" in found.reasons[0]
+    falls = AttenuationSettings(inverse_distance=True)
+    caplog.set_level("INFO", "gsparc")
+    assert chosen("array", attenuation=falls) == ((), False)
+    assert "effects.array -> off: attenuation.inverse_distance=true" in caplog.messages[0]
     with pytest.raises(ValueError, match=r"array=true is not possible: attenuation\.inverse_distance"):
-        plan(EffectSettings(array=True), InitSettings(), data, *said)
+        chosen("array", {"array": True}, attenuation=falls)
 
 
 def test_an_array_may_be_switched_off():
-    assert not planned("array", {"array": False}).array
+    assert not chosen("array", {"array": False})[1]
 
 
 @pytest.mark.parametrize(
@@ -81,7 +92,7 @@ def test_an_array_may_be_switched_off():
 )
 def test_terms_that_mean_nothing_here(kind, effects, message):
     with pytest.raises(ValueError, match=message):
-        planned(kind, effects)
+        chosen(kind, effects)
 
 
 @pytest.mark.parametrize(
@@ -97,4 +108,4 @@ def test_terms_that_mean_nothing_here(kind, effects, message):
 )
 def test_what_known_walls_cannot_serve(kind, effects, count, message):
     with pytest.raises(ValueError, match=f"init=scene is not possible: .*{message}"):
-        planned(kind, effects, "scene", count=count)
+        chosen(kind, effects, "scene", count=count)

@@ -120,14 +120,16 @@ def with_directions(path):
 
 
 SLOW = {  # of data: what makes them, their kind, the methods that train or search there
-    "spectra": (spectra, "spectrum", ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "gsparc")),
-    "spectra of a known array": (of_an_array("tx"), "spectrum", ("array", "ngrf", "gsparc")),
-    "spectra of a moving array": (
-        of_an_array("rx"), "spectrum", ("moving_array", "gsparc"),
+    "spectra": (
+        spectra, "spectrum", ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc"),
     ),
-    "channels": (channels, "csi", ("gsrf", "ngrf", "image_source_gp", "gsparc")),
+    "spectra of a known array": (of_an_array("tx"), "spectrum", ("array", "array_process", "ngrf", "gsparc")),
+    "spectra of a moving array": (
+        of_an_array("rx"), "spectrum", ("moving_array", "bearings", "gsparc"),
+    ),
+    "channels": (channels, "csi", ("gsrf", "ngrf", "image_source_gp", "image_sources", "channels", "gsparc")),
     "channels with directions": (with_directions, "csi", ("newrf", "directional_gp", "gsparc")),
-    "powers": (powers, "rssi_db", ("gsparc",)),
+    "powers": (powers, "rssi_db", ("powers", "gsparc")),
 }  # fmt: skip
 UPLINK = ("ridge", "fire", "uplink")
 

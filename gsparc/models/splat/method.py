@@ -54,7 +54,7 @@ QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
 class LearnedField(Method):
-    """A Gaussian field trained by gradient.
+    """A Gaussian field trained by gradient, with no process beside it (`model=splat`).
 
     Args:
         field, emission, attenuation, raster, confidence: all switches of the model.
@@ -70,6 +70,7 @@ class LearnedField(Method):
         guesses: settings the source of this configuration does not give, one line each.
     """
 
+    effects = "image"
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = True
@@ -88,7 +89,7 @@ class LearnedField(Method):
         loss: LossSettings = LossSettings(),
         optimizer: OptimizerSettings = OptimizerSettings(),
         response: ResponseSettings = ResponseSettings(),
-        name: str = "gsparc",
+        name: str = "splat",
         init: InitSettings | None = None,
         refit: bool = True,
         keep_best: bool = True,

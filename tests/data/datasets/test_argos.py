@@ -40,12 +40,6 @@ def test_stand_in_is_named_and_has_all_antennas() -> None:
     assert np.array_equal(city(3).target[:, 0], data.target[:, 3])
 
 
-def test_batches_carry_the_uplink() -> None:
-    data = city()
-    batch = data.batch(np.array([3, 5]))
-    assert np.array_equal(batch.uplink.numpy(), data.uplink[[3, 5]])
-
-
 def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
     csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
     tones = np.array(TONES, dtype=float)

@@ -91,17 +91,12 @@ TECHTILE = {
         "csi.nc, csi_imag: expected shape (E, C, H) with E = 2 as in csi_real, C = 8 as in csi_real, "
         "H = 3 as in csi_real, found (3, 8, 2); transposed?",
     ),
-    "few hosts": ({"hostname": (("g",), np.array(["A05", "A06"]))}, "csi.nc, hostname: expected shape (H,)"),
     "another host": (
         {"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
         "techtile_antenna_locations.yml: no antenna of the tiles G99",
     ),
     "no position": (
         {"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
-        "csi.nc: no cycle has both a position and a channel",
-    ),
-    "NaN positions": (
-        {"rover_y": (("experiment_id", "cycle_id"), np.full((2, CYCLES), np.nan))},
         "csi.nc: no cycle has both a position and a channel",
     ),
 }
@@ -158,16 +153,6 @@ def test_values_that_were_never_written_are_none(tmp_path):
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
-def test_powder_npz_is_geographic(tmp_path):
-    held, arrays = raw_of_powder(write_npz(tmp_path, "powder")).arrays, powder_arrays()
-    assert np.array_equal(held["latitude"], arrays["latitude"]) and "tx_position" not in held
-    where = np.stack([held["station_latitude"], held["station_longitude"]], axis=1)
-    assert np.abs(where - DEGREES).max() < 1e-9  # a tenth of a millimetre
-    assert held["station_name"].tolist() == STATIONS.tolist() and held["carrier_hz"] == 462.7e6
-    assert held["tx_height"] == 1.5 and held["station_height"] == 10
-    assert np.array_equal(held["rssi_db"], arrays["rssi_db"], equal_nan=True)
-
-
 def equal(one: np.ndarray, other: np.ndarray) -> bool:
     if one.dtype.kind == "f":
         return np.allclose(one, other, rtol=0, atol=1e-9, equal_nan=True)
@@ -205,17 +190,12 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
     assert "madsen-nuc2-b210" in raw.attributes["left_out"]
 
 
-HEADER = f"timestamp,bus-6186_rss,bus-6186_x,bus-6186_y,{','.join(STATIONS)},tx_x_coord,tx_y_coord\n"
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
 WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
-    "no header": ((HEADER, ""), TABLE, "are both named '-1'; is there no line of heads?"),
     "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),
-    "binary": (("", ""), "\x00\x01", "location_coordinates.json: not readable"),
     "no latitude": (("tx_x_coord", "east"), TABLE, "line 1: no column tx_x_coord; "),
-    "no longitude": (("tx_y_coord", "east"), TABLE, "line 1: no column tx_y_coord"),
     "swapped degrees": (SWAPPED, TABLE, "latitude is outside -90 to 90 degrees; are latitude and longitude swapped?"),
     "a word": ((":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"), TABLE, "column 'ebc-nuc1-b210', line 3: 'loud-"),
-    "cells missing": ((":00,-101,-1,-1", ":00"), TABLE, "line 2 (6 cells): expected 9 cells"),
     "no degrees": ((f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"), TABLE, "column 'tx_y_coord', line 21: no value"),
     "two transmitters": (("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"), TABLE, "line 1: no column tx_x_coord and tx_y_coord"),
     "column twice": ((STATIONS[1], STATIONS[0]), TABLE, "are both named 'ebc-nuc1-b210'"),
@@ -224,7 +204,6 @@ WALKS = {  # what is replaced in the walk (None: all of it), the table of statio
     "station in words": (("", ""), '{"ebc-nuc1-b210": ["north", 1]}', "ebc-nuc1-b210: expected latitude and"),
     "station beyond the pole": (("", ""), '{"ebc-nuc1-b210": [-111.8, 40.7]}', "ebc-nuc1-b210: latitude -111.8 is outside"),
     "table is code": (("", ""), "__import__('os').getcwd()", "location_coordinates.json: not readable"),
-    "table is a list": (("", ""), "[1, 2]", "expected a table from names"),
 }  # fmt: skip
 
 
@@ -248,25 +227,6 @@ def test_heights_are_metres(tmp_path, refused, height):
     refused("dataset.station_height=", raw_of_powder, path, None, 1.5, height)
 
 
-FAULTS = {  # of an array in the npz: what is done with it, and what is said, by the schema's name
-    "missing": ("ble", "mobile_position", None, "mobile_position: missing"),
-    "transposed": ("ble", "rssi_db", np.transpose, r"rssi_db: expected .*found \(4, 15\)"),
-    "NaN place": ("techtile", "tx_position", lambda a: a * np.nan, "tx_position, row 0, station 0 = "),
-    "beyond the pole": ("powder", "latitude", lambda a: a + 60, "latitude .* is outside -90 to 90"),
-}
-
-
-@pytest.mark.parametrize("case", FAULTS)
-def test_spoilt_files(tmp_path, refused, case):
-    name, array, change, says = FAULTS[case]
-
-    def spoilt(arrays):
-        rest = {key: value for key, value in arrays.items() if key != array}
-        return rest if change is None else {**rest, array: change(arrays[array])}
-
-    refused(says, lambda path: load({"name": name, "file": str(path)}), write_npz(tmp_path, name, spoilt))
-
-
 EVERY = pytest.mark.parametrize("name", MAKERS)
 
 
@@ -278,14 +238,6 @@ def test_absent_damaged_and_foreign_files(tmp_path, refused, name):
     refused("damaged or not an npz", LOADERS[name], path)
     foreign = write_npz(tmp_path, "ble" if name == "techtile" else "techtile")
     refused("position: missing", LOADERS[name], foreign)
-
-
-@EVERY
-def test_settings_of_the_configuration(tmp_path, name):
-    path = write_npz(tmp_path, name)
-    module = datamodule({"name": name, "file": str(path), "stations": [0, 2], "max_rows": 9})
-    assert module.selection.stations == (0, 2) and module.selection.max_rows == 9
-    assert module.name == name and module.selection.runs is None
 
 
 @pytest.mark.parametrize(

@@ -117,8 +117,8 @@ def test_an_edit_after_a_prediction_is_seen_by_the_next(tmp_path):
     batch = data.batch(np.arange(4))
     before = method.predict(batch).mean
     with torch.no_grad():
-        method.model.gaussians.opacity_logits.fill_(-9.0)
-        method.model.gaussians.version += 1
+        method.fitted().gaussians.opacity_logits.fill_(-9.0)
+        method.fitted().gaussians.version += 1
     assert method.predict(batch).mean.sum() < 0.1 * before.sum()
 
 

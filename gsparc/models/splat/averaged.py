@@ -1,0 +1,207 @@
+"""Gaussians that are rendered, averaged with a plain process: `array_process` and `image_process`."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data import heeded
+from gsparc.data.limits import check_arguments, switch
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.method import Method, Prediction
+from gsparc.models.mixture import solutions
+from gsparc.models.pareto import Settings
+from gsparc.models.reduced import averaged, mean_alone
+from gsparc.models.splat.auto_settings import resolve
+from gsparc.models.splat.method import LearnedField
+from gsparc.models.terms import no_array
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import Cost
+from gsparc.training.module import GaussianModule
+
+log = logging.getLogger(__name__)
+
+
+class ImageProcess(LearnedField):
+    """Gaussians that emit images, trained by rendering, and a plain process by its weight in the mean.
+
+    Args:
+        plain: whether a plain process may stand in, or be averaged in.
+        name: as it appears in tables.
+        **field: see `LearnedField`.
+    """
+
+    def __init__(self, plain: bool = True, name: str = "image_process", **field: Any) -> None:
+        check_arguments(locals(), plain=switch())
+        super().__init__(name=name, **field)
+        self.plain = plain
+        self.explained: float | None = None
+        self.chosen_by: type[Method] = type(self)  # as whose its checkpoints are read back
+        self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
+        self._average_mean: Method | None = None  # that process without its variance, made when first asked
+
+    @property
+    def stored_as(self) -> type[Method]:
+        """See `Method`."""
+        return self.chosen_by
+
+    @property
+    def effects(self) -> str:  # type: ignore[override]
+        """The terms that are computed, for `summary.json`."""
+        if self._alone:
+            return "residual"
+        base = "array" if self.settings.response.array else "image"
+        return base + ("+residual" if self._average is not None else "")
+
+    def called_for(self, array: bool, plain: bool) -> ImageProcess:
+        """Let Gaussians emit fields that the static receiver's array images, or images; return the method."""
+        self.settings = replace(self.settings, response=replace(self.settings.response, array=array))
+        self.plain, self.name = plain, "array_process" if array else "image_process"
+        return self
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
+        self._average, self._average_mean = None, None
+        with heeded.apart():
+            why = no_array(data.site, "rx", "the receiver moves") if self.settings.response.array else None
+            if why is not None:
+                raise ValueError(f"{self.name}: {why}")
+            if not self.settings.field.count:
+                self.most_steps = 0
+            choices, _ = resolve(self.settings, self.init.name, data.site)
+            log.info(
+                "training %s by rendering: %d Gaussians, terms %s, init=%s; callbacks %s",
+                GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
+                ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
+            )  # fmt: skip
+        with heeded.apart() as read:
+            report = super().fit(data, fold, context)
+        if not self._alone:
+            heeded.count(*read)
+        spent = dict(self.spent)
+        if self._average is not None:
+            method = self._average[0]
+            known = np.sort(np.concatenate([fold.train, fold.val]))
+            more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
+            report = replace(report, seconds=report.seconds + more.seconds)
+            spent["averaged process"] = more.seconds
+        spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
+        log.info("%s: %s", self.name, self.made)
+        unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
+        if self._alone:
+            unused = {name: s for name, s in spent.items() if name != "averaged process"}
+        return report.costing(Cost(spent, unused))
+
+    @property
+    def _alone(self) -> bool:
+        """Whether the averaged process has all the weight."""
+        return self._average is not None and self._average[1] >= 1
+
+    def _pays(self) -> bool:
+        """Whether the rendered field is worth another stage."""
+        return not self._alone
+
+    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        if self.plain:
+            self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
+            self.explained = self.explained if explained is None else explained
+
+    # -- answering ---------------------------------------------------------------------------------
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        if self._average is not None and not self.size():
+            return self._average[0].predict(query)
+        own = super().predict(query)
+        if self._average is None:
+            return own
+        if self._average_mean is None:
+            self._average_mean = mean_alone(self._average[0])
+        method, weight = self._average
+        if query.tx.dtype == torch.float64:
+            return replace(own, mean=own.mean.lerp(method.mean_at(query), weight))
+        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(query).mean, weight))
+
+    def gradient_problem(self) -> str | None:
+        """See `Method.gradient_problem`; a process alone has gradients."""
+        process_only = self._average is not None and not self.size()
+        return None if process_only else super().gradient_problem()
+
+    def reduced(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
+        """See `Reducible`."""
+        twin = copy.copy(self)
+        twin._average = None
+        result = LearnedField.reduced(twin, settings, measured)
+        return result if self._average is None else averaged(result, *self._average)
+
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return 0 if self._alone else super().size()
+
+    @property
+    def made(self) -> str:
+        """See `Method`."""
+        weight = 0.0 if self._average is None else self._average[1]
+        return super().made + (f"; a plain process weighs {weight:.2g}" if self.plain else "")
+
+    def field_alone(self) -> Method | None:
+        """See `Method.field_alone`."""
+        if self._average is None or not super().size():
+            return None
+        alone = copy.copy(self)
+        alone._average, alone._doubled = None, None
+        return alone
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """See `Method.facts`."""
+        return {**super().facts(), "model/variance_explained": self.explained}
+
+    # -- storing -----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Field, averaged process, and what was found out."""
+        beside = None
+        if self._average is not None:
+            method, weight = self._average
+            beside = {"state": method.state(), "weight": weight}
+        return {
+            "inner": super().state(),
+            "beside": beside,
+            "facts": {"explained": self.explained, "steps": self.steps},
+            "array": self.settings.response.array,
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self._average, self._average_mean = None, None
+        response = replace(self.settings.response, array=bool(state["array"]))
+        self.settings = replace(self.settings, response=response)
+        super().restore(site, state["inner"])
+        if state["beside"] is not None:
+            method = GaussianProcess()
+            method.restore(site, state["beside"]["state"])
+            self._average = method, float(state["beside"]["weight"])
+        self.explained, self.steps = state["facts"]["explained"], int(state["facts"]["steps"])
+
+
+class ArrayProcess(ImageProcess):
+    """Gaussians that emit fields, which the static receiver's array images.
+
+    Args:
+        name: as it appears in tables.
+        **field: see `ImageProcess`.
+    """
+
+    def __init__(self, name: str = "array_process", **field: Any) -> None:
+        super().__init__(name=name, **field)
+        self.settings = replace(self.settings, response=replace(self.settings.response, array=True))
