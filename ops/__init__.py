@@ -2,6 +2,17 @@
 
 `rasterize` = `make_plan` (footprints, visibility, depth order) + `composite` (linear in the features);
 `mean_weights` is its weights-only twin, `freeze` turns a static receiver's plan into a sparse matrix.
+
+>>> import torch
+>>> scene = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.5)
+>>> scene += (torch.tensor([0.8]),)  # mean [m], rotation, scales [m] and opacity of one Gaussian
+>>> plan = make_plan(*scene, Pose.identity(torch.zeros(3)), SphereGrid.hemisphere(9, 36))
+>>> composite(plan, *scene, torch.ones(1, 2)).image.shape  # of two channels
+torch.Size([1, 2, 9, 36])
+>>> mean_weights(plan, *scene).share  # nothing hides it
+tensor([[1.]])
+>>> freeze(plan, *scene, version=0).render(torch.ones(1, 2), version=0).shape
+torch.Size([2, 9, 36])
 """
 
 if __name__ != "gsparc.ops":

@@ -15,7 +15,7 @@ class BackendUnavailable(RuntimeError):
 
 
 def choose(name: str | None, device: torch.device) -> ModuleType:
-    """The backend called `name`, or the one of `device` (BackendUnavailable, ValueError)."""
+    """Return the backend called `name`, or the one of `device` (BackendUnavailable, ValueError)."""
     if name is None:
         name = device.type
     backend = named(name)
@@ -25,7 +25,13 @@ def choose(name: str | None, device: torch.device) -> ModuleType:
 
 
 def named(name: str) -> ModuleType:
-    """The backend called `name` (BackendUnavailable, ValueError)."""
+    """Return the backend called `name` (BackendUnavailable, ValueError).
+
+    >>> named("tpu")
+    Traceback (most recent call last):
+        ...
+    ValueError: backend is 'reference', 'cpu' or 'cuda', got 'tpu'
+    """
     if name == "reference":
         return reference_backend
     if name == "cpu":

@@ -21,6 +21,12 @@ def channels(
 
     Complex numbers are pairs of real ones on the last axis; differentiable in every tensor.
 
+    >>> gains = torch.tensor([[[1.0, 0.0], [0.5, 0.0]]])  # of two paths, real
+    >>> steering = torch.tensor([1.0, 0.0]).expand(2, 1, 2)  # of one antenna
+    >>> delays = torch.tensor([0.0, 50e-9], dtype=torch.float64)
+    >>> channels(gains, steering, delays, 0.0, 10e6, 2)[0, 0, :, 0]  # in phase, then half a turn apart
+    tensor([1.5000, 0.5000])
+
     Args:
         gains: (B, N, 2), float32 or float64.
         steering: (N, A, 2), the same.
@@ -61,6 +67,7 @@ def summed(
     """The same (B, A, K, 2) in plain PyTorch; the reference. `tones`: first and spacing [Hz]."""
     numbers = torch.arange(subcarriers, dtype=torch.float64, device=gains.device)
     turns = torch.outer(delays, tones[0] + tones[1] * numbers)
+    # Whole turns go first: 2 pi times 1e6 turns would round six digits of the phase away.
     phase = -2 * math.pi * (turns - turns.detach().floor())
     factor = torch.polar(torch.ones_like(phase), phase).to(
         torch.view_as_complex(gains[:0].contiguous()).dtype

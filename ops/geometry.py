@@ -73,14 +73,24 @@ class Pose:
         return Pose(self.position.to(*args, **kwargs), self.rotation.to(*args, **kwargs))
 
     def local(self, points: Tensor) -> Tensor:
-        """World points (N, 3) [m] in the receiver frame: (N, 3), or (P, N, 3) for P poses."""
+        """Return world points (N, 3) [m] in the receiver frame: (N, 3), or (P, N, 3) for P poses.
+
+        >>> left = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # turned by 90 degrees
+        >>> Pose(torch.tensor([1.0, 0.0, 0.0]), left).local(torch.tensor([[1.0, 2.0, 0.0]]))
+        tensor([[2., 0., 0.]])
+        """
         # (x - p) R applies R^T to each row.
         return (points - self.position.unsqueeze(-2)) @ self.rotation
 
     @staticmethod
     def identity(position: Tensor) -> Pose:
-        """Poses at `position` (3,) or (P, 3) [m] whose local axes are the world's."""
+        """Return poses at `position` (3,) or (P, 3) [m] whose local axes are the world's.
+
+        >>> len(Pose.identity(torch.zeros(4, 3)))
+        4
+        """
         eye = torch.eye(3, dtype=position.dtype, device=position.device)
+        # A view of one matrix: P poses cost the memory of one rotation.
         return Pose(position, eye.expand(*position.shape[:-1], 3, 3))
 
 
@@ -120,6 +130,7 @@ class SphereGrid:
             raise ValueError(f"a grid needs finite angles, got {self}")
         if self.height < 1 or self.width < 1 or self.elevation_step <= 0 or self.azimuth_step <= 0:
             raise ValueError(f"a grid needs at least one pixel and positive steps, got {self}")
+        # With a margin: 360 steps of 2 pi / 360 may round to more than the circle.
         if self.width * self.azimuth_step > 2 * math.pi * (1 + 1e-6):
             raise ValueError(f"{self.width} columns of {self.azimuth_step} rad exceed the circle")
         if self.width > WIDEST_GRID:
@@ -141,39 +152,60 @@ class SphereGrid:
         return float(self.width) if self.periodic else 2 * math.pi / self.azimuth_step
 
     def elevations(self) -> Tensor:
-        """Row centres (H,) float64 [rad]."""
+        """Return row centres (H,) float64 [rad]."""
         return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=torch.float64)
 
     def azimuths(self) -> Tensor:
-        """Column centres (W,) float64 [rad]."""
+        """Return column centres (W,) float64 [rad].
+
+        >>> SphereGrid.hemisphere(2, 4).azimuths().rad2deg()
+        tensor([  0.,  90., 180., 270.], dtype=torch.float64)
+        """
         return self.first_azimuth + self.azimuth_step * torch.arange(self.width, dtype=torch.float64)
 
     def directions(self, dtype: torch.dtype = torch.float64) -> Tensor:
-        """Unit vectors of the pixel centres (H, W, 3), receiver frame."""
+        """Return unit vectors of the pixel centres (H, W, 3), receiver frame.
+
+        >>> SphereGrid.hemisphere(2, 4).directions().shape
+        torch.Size([2, 4, 3])
+        """
         elevation, azimuth = self.elevations()[:, None], self.azimuths()[None, :]
         level, upright = elevation.cos(), elevation.sin().expand(self.height, self.width)
         return torch.stack([level * azimuth.cos(), level * azimuth.sin(), upright], dim=-1).to(dtype)
 
     def solid_angles(self) -> Tensor:
-        """Solid angle of each pixel (H, W) float64 [sr]; cells are cut off at the poles."""
+        """Return the solid angle of each pixel (H, W) float64 [sr]; cells are cut off at the poles.
+
+        >>> round(float(SphereGrid.full_sphere(90, 180).solid_angles().sum()) / math.pi, 6)
+        4.0
+        """
         elevation, half = self.elevations(), self.elevation_step / 2
         upper = (elevation + half).clamp(-math.pi / 2, math.pi / 2).sin()
         lower = (elevation - half).clamp(-math.pi / 2, math.pi / 2).sin()
+        # The integral of cos(elevation) over a cell is a difference of sines, without approximation.
         return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width)
 
     def edges(self) -> tuple[float, float, float, float]:
-        """Least and largest azimuth, least and largest elevation of the pixels' edges [degrees]."""
+        """Return least and largest azimuth, least and largest elevation of the pixels' edges [degrees].
+
+        >>> [round(edge, 3) for edge in SphereGrid.hemisphere(90, 360).edges()]
+        [-0.5, 359.5, -0.5, 89.5]
+        """
         across, up = math.degrees(self.azimuth_step), math.degrees(self.elevation_step)
         left, low = math.degrees(self.first_azimuth) - across / 2, math.degrees(self.first_elevation) - up / 2
         return left, left + self.width * across, low, low + self.height * up
 
     @staticmethod
     def hemisphere(height: int = 90, width: int = 360) -> SphereGrid:
-        """The RFID release's grid: row i at i steps above the horizon, column j at j steps of azimuth."""
+        """Return the RFID release's grid: row i is i steps above the horizon, column j is at j of azimuth."""
         return SphereGrid(height, width, 0.0, 0.0, math.pi / 2 / height, 2 * math.pi / width)
 
     @staticmethod
     def full_sphere(height: int = 180, width: int = 360) -> SphereGrid:
-        """All directions; row centres half a step from the poles, column 0 at azimuth 0."""
+        """Return all directions; row centres half a step from the poles, column 0 at azimuth 0.
+
+        >>> SphereGrid.full_sphere(2, 4).elevations().rad2deg()
+        tensor([-45.,  45.], dtype=torch.float64)
+        """
         step = math.pi / height
         return SphereGrid(height, width, -math.pi / 2 + step / 2, 0.0, step, 2 * math.pi / width)

@@ -13,7 +13,11 @@ from gsparc.ops.transforms import beyond_kernels, full_precision
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
-    """Outputs (B, N, C) of N networks at B encoded positions; differentiable in every tensor.
+    """Return outputs (B, N, C) of N networks at B encoded positions; differentiable in every tensor.
+
+    >>> inputs, first, second = torch.ones(5, 4), torch.ones(2, 4, 3), torch.ones(2, 3, 1)
+    >>> networks(inputs, first, torch.zeros(2, 3), second, torch.zeros(2, 1))[:, :, 0].shape
+    torch.Size([5, 2])
 
     Args:
         encoded: (B, E), the same for all Gaussians.

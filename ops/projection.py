@@ -47,6 +47,7 @@ def _tangent_frame(
     n, still = direction, direction.detach()
     halfway = (n + still) / (1 + (n * still).sum(-1, keepdim=True))
     east, north = (e - halfway * (n * e).sum(-1, keepdim=True) for e in (east.detach(), north.detach()))
+    # A pixel of the tangent plane is one elevation step in both directions, at any elevation.
     return torch.full_like(cosine, 1 / grid.elevation_step), east, north
 
 
@@ -54,6 +55,7 @@ def _tangent_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple[
     u = grid.directions(shift.dtype).to(shift.device).flatten(0, 1)
     cosine = seen.direction @ u.mT
     facing = cosine > HORIZON_COSINE
+    # Beyond the horizon a division by nearly 0 would give gradients of NaN to pixels that do not count.
     cosine = torch.where(facing, cosine, 1.0)
     p, q = (seen.east @ u.mT) / cosine, (seen.north @ u.mT) / cosine
     # Moving the centre by d along the sphere moves the offset by -(d + q (q . d)) (gnomonic projection).
@@ -66,6 +68,7 @@ def _tangent_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple[
 def _equirect_frame(
     direction: Tensor, east: Tensor, north: Tensor, cosine: Tensor, grid: SphereGrid
 ) -> tuple[Tensor, Tensor, Tensor]:
+    # At the pole a radian to the east is infinitely many columns: one step of elevation bounds it.
     return 1 / ((cosine**2 + grid.elevation_step**2).sqrt() * grid.azimuth_step), east, north
 
 
@@ -74,6 +77,7 @@ def _equirect_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple
     column = torch.arange(grid.width, dtype=shift.dtype, device=shift.device) - center[:, :1]
     row = torch.arange(grid.height, dtype=shift.dtype, device=shift.device) - center[:, 1:]
     turn = grid.turn
+    # The shorter way around the circle; which way it is has no derivative.
     column = column - turn * torch.round(column.detach() / turn)
     size = (-1, grid.height, grid.width)
     p, q = column[:, None, :].expand(size).flatten(1), row[:, :, None].expand(size).flatten(1)

@@ -70,6 +70,7 @@ def _plan(
     validation.transforms(gaussians, pose, pose_trained)
     chosen = backends.choose(backend, gaussians.means.device)
     with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), unfollowed():
+        # Order and visibility are choices without a derivative: neither autograd nor `torch.func` sees them.
         still = Gaussians._make(map(plain, gaussians))
         poses = validation.poses(Pose(plain(pose.position), plain(pose.rotation)), still.means)
         plan = chosen.make_plan(validation.strongest(still), plain(ids), poses, grid, optics)
@@ -122,6 +123,7 @@ def composite(
     validation.check_features(features)
     plain = beyond_kernels(*gaussians, features)
     trained = _trained(plan, *gaussians, features) and not plain
+    # A leaf of its own: after `backward` its `.grad` is the screen-space gradient that densification reads.
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
     backend = reference_by_rows if plain else backends.named(plan.backend)
     image, transmittance = backend.composite(plan, gaussians, values, means2d)
@@ -146,9 +148,18 @@ def rasterize(
     ids: Tensor | None = None,
     backend: str | None = None,
 ) -> Raster:
-    """`make_plan`, then `composite`: see there. `features` (N, C) or (B, N, C) holds real channels.
+    """Render features (N, C) or (B, N, C), real, in one call: `make_plan`, then `composite`; see there.
 
     Where no gradient is asked for, the `cpu` backend does both in one call and keeps no plan; same bits.
+
+    >>> pose, grid = Pose.identity(torch.zeros(3)), SphereGrid.hemisphere(9, 36)
+    >>> means, quats = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    >>> scales, opacities, features = torch.full((1, 3), 0.5), torch.tensor([0.8]), torch.ones(1, 1)
+    >>> raster = rasterize(means, quats, scales, opacities, features, pose, grid)
+    >>> raster.image.shape, raster.transmittance.shape
+    (torch.Size([1, 1, 9, 36]), torch.Size([1, 9, 36]))
+    >>> bool(torch.allclose(raster.image[0], 1 - raster.transmittance, atol=1e-6))  # one feature, of 1
+    True
     """
     chosen = backends.choose(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)

@@ -43,7 +43,11 @@ class Projected:
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) of quaternions (N, 4) w x y z of any length; the zero quaternion does not turn."""
+    """Return rotations (N, 3, 3) of quaternions (N, 4) w x y z of any length; the zero one does not turn.
+
+    >>> rotation_matrices(torch.tensor([[0.0, 0.0, 0.0, 2.0]]))[0].diagonal()  # half a turn about z
+    tensor([-1., -1.,  1.])
+    """
     longest = quats.detach().abs().amax(-1, keepdim=True)
     usable = longest > SHORTEST_QUATERNION
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
@@ -107,13 +111,16 @@ def project(
     )
     area = to_column * to_row * _norm(cofactors * torch.einsum("nki,nk->ni", axes, n))
     eps = optics.low_pass
+    # det(K + eps 1) = det K + eps trace K + eps^2: a sum of positive terms, nothing cancels.
     determinant = area**2 + eps * (k11 + k22) + eps**2
     sharp = (determinant > torch.finfo(means.dtype).tiny) & (k22 + eps > torch.finfo(means.dtype).tiny)
     determinant, k22 = torch.where(sharp, determinant, 1.0), torch.where(sharp, k22, 1.0)
 
     fade = ((distance - optics.near) / optics.near).clamp(0, 1)
+    # A smoothstep: value and slope are continuous where it begins and ends.
     gain = fade**2 * (3 - 2 * fade)
     if optics.compensate:
+        # A footprint holds its peak times the root of its determinant, which was `area` before the low-pass.
         gain = gain * area / determinant.sqrt()
     return Projected(
         present=present & sharp,
@@ -153,6 +160,7 @@ def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
     by_id = (
         torch.arange(len(seen.distance), device=seen.distance.device) if ids is None else torch.argsort(ids)
     )
+    # A stable sort by distance after one by id: equal distances stay in the order of ids.
     return by_id[torch.argsort(seen.distance.detach()[by_id], stable=True)]
 
 
@@ -163,6 +171,7 @@ def layers(
     emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
     strongest = torch.maximum(emits, hides)
     strength = shapes if optics.cutoff.relative else strongest
+    # Whether a layer counts is a choice without a derivative.
     counts = ((strength >= optics.cutoff.alpha) & (strongest > 0)).detach()
     return (
         torch.where(counts, emits, 0.0).clamp(max=ALPHA_MAX),
@@ -171,10 +180,16 @@ def layers(
 
 
 def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-    """Transmittance before each layer (N, H W), 0 once below `floor`, and behind all layers (H W,)."""
+    """Return transmittance before each layer (N, H W), 0 once below `floor`, and behind all layers (H W,).
+
+    >>> before, behind = transmittances(torch.tensor([[0.5], [0.5]]), 0.0)
+    >>> before[:, 0].tolist(), behind.tolist()
+    ([1.0, 0.5], [0.25])
+    """
     clear = gamma.new_ones(1, gamma.shape[1])
     with torch.no_grad():
         lit = torch.cumprod(torch.cat([clear, 1 - gamma]), 0)[:-1] >= floor
+    # Layers that the floor cuts off neither emit nor hide; a product of factors up to 1 never rises again.
     light = torch.cumprod(torch.cat([clear, 1 - torch.where(lit, gamma, 0.0)]), 0)
     return torch.where(lit, light[:-1], 0.0), light[-1]
 
@@ -182,7 +197,9 @@ def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
 def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:
     """Long half axes (N,) [px] of the footprints at the cut-off of opacities (or extinctions) `strongest`."""
     k11, k12, k22 = seen.covariance.unbind(-1)
+    # The larger eigenvalue of a symmetric 2 x 2 matrix; `hypot` does not overflow where squares would.
     largest = (k11 + k22) / 2 + torch.hypot((k11 - k22) / 2, k12)
     peak = torch.ones_like(strongest) if optics.cutoff.relative else seen.gain * strongest
+    # The half axis r at which peak exp(-r^2 / (2 eigenvalue)) has fallen to the cut-off.
     reach = 2 * torch.log(torch.where(seen.present, peak, 0.0) / optics.cutoff.alpha)
     return (reach.clamp(min=0) * largest).sqrt()

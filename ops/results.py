@@ -94,8 +94,13 @@ class Weights:
 
 
 def visible_share(seen: Tensor, total: Tensor) -> Tensor:
-    """`Weights.share` of the sums over pixels of alpha T and of alpha."""
+    """Return `Weights.share` of the sums over pixels of alpha T and of alpha.
+
+    >>> visible_share(torch.tensor([0.2, 0.0]), torch.tensor([0.8, 0.0]))
+    tensor([0.2500, 0.0000])
+    """
     bright = total > FAINTEST
     part, whole = seen.detach(), total.detach()  # `no_grad` would let tangents through
+    # `where` computes both branches: the inner one keeps 0 / 0 and its NaN gradient out.
     faint = torch.where(whole > 0, part / torch.where(whole > 0, whole, 1.0), 0.0)
     return torch.where(bright, seen / torch.where(bright, total, 1.0), faint)

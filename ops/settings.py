@@ -32,6 +32,11 @@ FAINTEST = 1e-30
 class Cutoff:
     """When a Gaussian stops counting at a pixel.
 
+    >>> Cutoff(alpha=2.0)
+    Traceback (most recent call last):
+        ...
+    ValueError: cut-offs lie in (0, 1), got alpha 2.0, transmittance 0.0001
+
     Attributes:
         alpha: it counts where its layer opacity is at least this; 1/255 is right for images.
         transmittance: it counts where the light that reaches it is at least this.

@@ -48,6 +48,7 @@ def unwrapped(value: Tensor, axis: int) -> tuple[Tensor, int]:
     """The numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
     while _functorch.is_functorch_wrapped_tensor(value):
         hidden = _functorch.maybe_get_bdim(value)
+        # A hidden axis at or before it moves it back by one.
         axis += 0 <= hidden <= axis
         value = _functorch.get_unwrapped(value)
     return value, axis

@@ -85,6 +85,7 @@ def finite(gaussians: Gaussians, pose: Pose) -> None:
     }
     for name, ok in valid.items():
         if not bool(ok.all()):
+            # The first that is not: torch has no argmin of bool.
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
