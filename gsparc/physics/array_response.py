@@ -21,7 +21,11 @@ SAME_LAG = 1e-4  # two element differences closer than this many wavelengths are
 
 
 def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> Tensor:
-    """Steering matrix A (M, H * W) complex128: `exp(+j k u.a_m)`.
+    """Return the steering matrix A (M, H * W) complex128: `exp(+j k u.a_m)`.
+
+    >>> array = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])  # half a wavelength of 10 cm apart
+    >>> steering(array, SphereGrid.hemisphere(1, 4), 0.1)[1].real.round(decimals=3)
+    tensor([-1.,  1., -1.,  1.], dtype=torch.float64)
 
     Args:
         array: (M, 3) [m], receiver frame.
@@ -51,12 +55,21 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
 
 
 def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
-    """`|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0."""
+    """Return `|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0.
+
+    >>> array, grid = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), SphereGrid.hemisphere(1, 4)
+    >>> matrix = steering(array, grid, 0.1)
+    >>> bartlett(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y: x is where it interferes
+    tensor([[0., 2., 0., 2.]], dtype=torch.float64)
+    """
     return _SafeAbsolute.apply(vectors @ matrix.conj())
 
 
 def normalised(image: Tensor, how: str) -> Tensor:
-    """The spectrum (B, P) as a dataset publishes it: `max`, `minmax`, `power` (unit mean square) or `none`.
+    """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1) or `none`.
+
+    >>> normalised(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")
+    tensor([[0.0000, 0.2500, 1.0000]])
 
     Raises:
         ValueError: another name.
@@ -70,6 +83,7 @@ def normalised(image: Tensor, how: str) -> Tensor:
         high = image.square().mean(1, keepdim=True).sqrt()
     else:
         raise ValueError(f"normalisation {how!r} is none of max, minmax, power, none")
+    # The least divisor leaves a silent spectrum at 0; it would be NaN.
     return (image - low) / (high - low).clamp_min(1e-12)
 
 
@@ -120,10 +134,16 @@ class Lags:
 
 
 def lags(array: np.ndarray, wavelength: float) -> Lags:
-    """The co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one."""
+    """Return the co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one.
+
+    >>> square = np.stack([*np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))], -1).reshape(-1, 3)
+    >>> lags(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
+    (25, 3)
+    """
     array = np.asarray(array, dtype=np.float64)
     m = len(array)
     difference = array[:, None] - array[None]
+    # As whole numbers: rounding would make two lags of one difference.
     cell = np.round(difference / (SAME_LAG * wavelength)).astype(np.int64).reshape(-1, 3)
     # One half-space of differences: the first nonzero coordinate is positive.
     lead = np.where(cell[:, 0] != 0, cell[:, 0], np.where(cell[:, 1] != 0, cell[:, 1], cell[:, 2]))
@@ -131,6 +151,7 @@ def lags(array: np.ndarray, wavelength: float) -> Lags:
     unique, which = np.unique(cell * np.where(sign == 0, 1, sign)[:, None], axis=0, return_inverse=True)
     which = which.reshape(-1)
     zero = int(np.flatnonzero((unique == 0).all(1))[0])
+    # The zero lag is the first, as it alone has no sine.
     order = np.concatenate([[zero], np.delete(np.arange(len(unique)), zero)])
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))

@@ -35,6 +35,7 @@ class SpectrumRenderer(nn.Module):
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float, background: Tensor) -> None:
         super().__init__()
         known = lags(array, wavelength)
+        # Half a turn of azimuth takes d.u to -d.u for elements in a plane: cosines stay, sines change sign.
         planar = float(np.ptp(array[:, 2])) < 1e-6 * wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0
         pairs = torch.stack([known.real_pairs, known.imag_pairs], 1).flatten(0, 1)
@@ -89,6 +90,7 @@ def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Ten
     spectrum = torch.fft.rfft(basis, dim=1) / width
     peak = spectrum.abs().amax((0, 2))
     harmonics = torch.nonzero(peak > NEGLIGIBLE * peak.max()).squeeze(1)
+    # `rfft` keeps one of two conjugates: all count twice but the mean and the highest of an even width.
     twice = torch.where((harmonics == 0) | (2 * harmonics == width), 1.0, 2.0).double()
     turn = 2 * torch.pi / width * harmonics[:, None] * torch.arange(columns, dtype=torch.float64)
     waves = torch.stack([twice[:, None] * turn.cos(), -twice[:, None] * turn.sin()], 1).flatten(0, 1)

@@ -43,6 +43,7 @@ class Lags:
         self.count = 2 * len(self._share) - 1
         angle = differences @ grid.directions().numpy().reshape(-1, 3).T
         waves = np.concatenate([np.cos(angle), np.sin(angle[1:])])
+        # Of d and -d together: r e^(-j a) + conj(r) e^(j a) = 2 (Re r cos a + Im r sin a).
         waves[1 : len(angle)] *= 2
         waves[len(angle) :] *= 2
         basis = torch.from_numpy(waves).reshape(self.count, grid.height, grid.width)
@@ -68,5 +69,5 @@ class Lags:
         return (self.pixels.of(power).double() @ self._inverse).float()
 
     def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:
-        """Power (n, H, W), at least 0, of lags (n, count); on `pixels`, these lags' thinned, if given."""
+        """Return power (n, H, W), at least 0, of lags (n, count); on `pixels`, thinned ones, if given."""
         return (pixels or self.pixels).images(lags @ self._basis).clamp_min(0)

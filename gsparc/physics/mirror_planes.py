@@ -16,7 +16,11 @@ Reflections = tuple[int, ...]  # indices of planes, in the order in which they m
 
 
 def reflect(points: Tensor, planes: Tensor) -> Tensor:
-    """Mirror points (..., 3) [m] in planes (..., 4), broadcast against each other."""
+    """Mirror points (..., 3) [m] in planes (..., 4), broadcast against each other.
+
+    >>> reflect(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))  # in the floor z = 0
+    tensor([ 1.,  2., -3.])
+    """
     length = torch.linalg.vector_norm(planes[..., :3], dim=-1, keepdim=True)
     normal = planes[..., :3] / length
     height = (points * normal).sum(-1, keepdim=True) - planes[..., 3:]
@@ -24,7 +28,11 @@ def reflect(points: Tensor, planes: Tensor) -> Tensor:
 
 
 def bisector(first: Tensor, second: Tensor) -> Tensor:
-    """The planes (..., 4) that mirror `first` (..., 3) into `second` (..., 3)."""
+    """Return the planes (..., 4) that mirror `first` (..., 3) into `second` (..., 3).
+
+    >>> bisector(torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 5.0]))  # z = 3
+    tensor([0., 0., 1., 3.])
+    """
     offset = second - first
     normal = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
     return torch.cat([normal, (normal * (first + second) / 2).sum(-1, keepdim=True)], -1)
@@ -33,9 +41,16 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
 def images(
     transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]
 ) -> Tensor:
-    """Positions (..., K, 3) [m] of sequences; differentiable in transmitter (..., 3) and planes (P, 4)."""
+    """Return positions (..., K, 3) [m] of sequences, with gradients by transmitter (..., 3) and planes (P, 4).
+
+    >>> planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 5.0]])  # the floor, and a wall x = 5
+    >>> images(torch.tensor([1.0, 2.0, 3.0]), planes, [(0,), (0, 1)])
+    tensor([[ 1.,  2., -3.],
+            [ 9.,  2., -3.]])
+    """
     order = max(map(len, sequences), default=0)
     place = transmitter[..., None, :].expand(*transmitter.shape[:-1], len(sequences), 3)
+    # Shorter sequences end in -1, which mirrors nothing: all are mirrored in as many steps.
     indices = torch.tensor([[*w, *[-1] * (order - len(w))] for w in sequences], dtype=torch.long)
     for step in range(order):
         index = indices[:, step]
@@ -45,10 +60,13 @@ def images(
 
 
 def orientations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
-    """Orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
+    """Return orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
 
     One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.
     Soc. Am. 65 (1979)); a sequence is their product, the first plane rightmost.
+
+    >>> orientations(torch.tensor([[0.0, 0.0, 1.0, 2.0]]), [(0,)])[0].diagonal()  # z turns round
+    tensor([ 1.,  1., -1.])
     """
     ends = torch.cat([torch.zeros(1, 3, dtype=planes.dtype), torch.eye(3, dtype=planes.dtype)])
     placed = images(ends, planes, sequences)  # (4, K, 3)
@@ -56,7 +74,11 @@ def orientations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Refle
 
 
 def all_sequences(indices: list[int], order: int) -> list[Reflections]:
-    """Sequences of 1 to `order` planes in which none follows itself (a mirror twice is no mirror)."""
+    """Return sequences of 1 to `order` planes in which none follows itself (a mirror twice is no mirror).
+
+    >>> all_sequences([0, 1], order=2)
+    [(0,), (1,), (0, 1), (1, 0)]
+    """
     return [
         sequence
         for length in range(1, order + 1)

@@ -41,8 +41,13 @@ class Aperture:
 
 
 def flat_places(array: np.ndarray, wavelength: float) -> Tensor:
-    """Antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes."""
+    """Return antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes.
+
+    >>> flat_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()  # about the middle
+    tensor([1., 1.])
+    """
     centred = (array - array.mean(axis=0)) / wavelength
+    # Right singular vectors of centred places are their principal axes, the widest first.
     axes = np.linalg.svd(centred, full_matrices=True)[2][:2]
     return torch.from_numpy(centred @ axes.T).float()
 
@@ -97,7 +102,11 @@ class Columns:
 
 
 def phasor(turns: Tensor) -> Tensor:
-    """exp(j 2 pi turns), complex."""
+    """Return exp(j 2 pi turns), complex.
+
+    >>> phasor(torch.tensor(0.5)).real
+    tensor(-1.)
+    """
     return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
@@ -112,5 +121,11 @@ def delays(delay: Tensor, aperture: Aperture) -> Tensor:
 
 
 def mean_delay(snapshot: Tensor) -> Tensor:
-    """Power-weighted mean delay (B,) of snapshots (B, A, K), turns per tone, from neighbouring tones."""
+    """Return the mean delay (B,) [turns per tone], by power, of snapshots (B, A, K), from neighbouring tones.
+
+    >>> aperture = Aperture(torch.zeros(1, 2), torch.arange(4.0))
+    >>> mean_delay(delays(torch.tensor([[0.1]]), aperture))  # one path, as (B, 1, K)
+    tensor([0.1000])
+    """
+    # From one tone to the next a path turns by -2 pi times its delay; the sum weighs paths by their power.
     return -torch.angle((snapshot[..., 1:] * snapshot[..., :-1].conj()).sum((1, 2))) / (2 * math.pi)

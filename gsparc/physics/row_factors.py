@@ -19,26 +19,40 @@ AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
 def words(freedom: Freedom) -> str:
-    """For messages: `a phase and a delay`."""
+    """For messages: `a phase and a delay`.
+
+    >>> words("phase+delay+gain")
+    'a phase, a delay and a gain'
+    """
     parts = [f"a {part}" for part in freedom.split("+")]
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 def delays(tones: np.ndarray) -> np.ndarray:
-    """Delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0."""
+    """Return delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0.
+
+    >>> len(delays(np.array([0.0, 1e6, 2e6]))), float(delays(np.array([0.0, 1e6, 2e6]))[-1])
+    (17, 5e-07)
+    """
     tones = np.sort(tones)
     width, gaps = tones[-1] - tones[0], np.diff(tones)
     if width <= 0:
         return np.zeros(1)
     step = 1 / (FINE * width)
+    # Tones df apart cannot tell delays that differ by 1 / df: half of that on either side.
     half = min(int(0.5 / (gaps[gaps > 0].min() * step)), MOST_DELAYS // 2)
     return step * np.arange(-half, half + 1)
 
 
 def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom) -> np.ndarray:
-    """Factors (n, K) that turn rows to their references best; 1 where nothing is free.
+    """Return factors (n, K) that turn rows to their references best; 1 where nothing is free.
 
     The delay is the largest of the correlation over tones, between samples by a parabola.
+
+    >>> reference = np.ones((1, 2, 8), complex)  # of one row: two antennas, eight tones
+    >>> factor = turning(1j * reference, reference, np.arange(8) * 1e6, "phase")
+    >>> bool(np.allclose(factor[:, None] * 1j * reference, reference))
+    True
 
     Args:
         values: (n, A, K) complex, 0 where nothing was measured.
@@ -59,6 +73,7 @@ def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedo
         size = np.abs(product @ steering.T)
         rows, best = np.arange(len(size)), size.argmax(1).clip(1, len(tried) - 2)
         before, peak, after = (size[rows, best + by] for by in (-1, 0, 1))
+        # The vertex of a parabola through the largest and both neighbours; never flat, so that it exists.
         curvature = np.minimum(before - 2 * peak + after, -np.finfo(float).tiny)
         slope = tried[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (tried[1] - tried[0])
     turned = np.exp(2j * np.pi * slope[:, None] * (tones - tones.mean()))
@@ -66,5 +81,6 @@ def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedo
     factor = turned * np.exp(-1j * np.angle(overlap))[:, None]
     if freedom == "phase+delay+gain":
         own = (np.abs(values) ** 2).sum((1, 2))
+        # The gain of least squares; a row of zeros keeps 1.
         factor *= np.divide(np.abs(overlap), own, out=np.ones_like(own), where=own > 0)[:, None]
     return factor

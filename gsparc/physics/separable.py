@@ -32,11 +32,11 @@ class Separable:
         return len(self.rows), self.columns.shape[1]
 
     def of(self, images: Tensor) -> Tensor:
-        """Coefficients (n, R * C) of images (n, H, W), by least squares."""
+        """Return coefficients (n, R * C) of images (n, H, W), by least squares."""
         return ((self.rows.T @ images) @ self.columns.T).flatten(1)
 
     def images(self, coefficients: Tensor) -> Tensor:
-        """Images (n, H, W) of coefficients (n, R * C)."""
+        """Return images (n, H, W) of coefficients (n, R * C)."""
         return self.rows @ (coefficients.unflatten(1, (-1, len(self.columns))) @ self.columns)
 
     def thinned(self, stride: int) -> Separable:
@@ -45,7 +45,11 @@ class Separable:
 
 
 def separable(blocks: Iterable[Tensor], lost: float) -> Separable:
-    """The basis in which each mode of images loses at most the share `lost` of their energy.
+    """Find the basis in which each mode of images loses at most the share `lost` of their energy.
+
+    >>> basis = separable([torch.ones(5, 3, 4)], lost=1e-6)  # five equal images of 3 x 4 pixels
+    >>> basis.rows.shape, basis.columns.shape
+    (torch.Size([3, 1]), torch.Size([1, 4]))
 
     Args:
         blocks: images (n, H, W) in parts; float64 where `lost` is below a float32's rounding.
@@ -67,6 +71,7 @@ def separable(blocks: Iterable[Tensor], lost: float) -> Separable:
 def _principal(gram: Tensor, lost: float) -> Tensor:
     """Eigenvectors (P, K) float32 of the largest eigenvalues; the others hold at most the share `lost`."""
     values, vectors = torch.linalg.eigh(gram)
+    # `eigh` sorts upwards: the first whose sum stays below the share are the ones that go.
     tail = values.clamp_min(0).cumsum(0)
     count = int((tail > lost * tail[-1]).sum())
     return vectors[:, len(gram) - max(count, 1) :].flip(1).float()

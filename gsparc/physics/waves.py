@@ -17,9 +17,12 @@ NEAR_M = 0.001  # no receiver comes closer to a source; keeps 1/r and its slope 
 
 
 def ranges(observers: Tensor, sources: Tensor) -> Tensor:
-    """Ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m], at least `NEAR_M`.
+    """Return ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m], at least `NEAR_M`.
 
     Sources (n, K, 3) are each observer's own.
+
+    >>> ranges(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]])).round(decimals=3)
+    tensor([[5.]], dtype=torch.float64)
     """
     offset = observers.double()[:, None, :] - sources.double()
     return (offset.square().sum(-1) + NEAR_M**2).sqrt()
@@ -28,7 +31,10 @@ def ranges(observers: Tensor, sources: Tensor) -> Tensor:
 def reduced_phase(
     distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """`-2 pi f r / c` brought into [-pi, pi] in float64, then cast.
+    """Return `-2 pi f r / c` brought into [-pi, pi] in float64, then cast.
+
+    >>> reduced_phase(torch.tensor(2.25, dtype=torch.float64), LIGHT)  # two wavelengths of 1 m and a quarter
+    tensor(-1.5708)
 
     Args:
         distance: (...) [m]; made float64. Its gradient is that of the unreduced phase.
@@ -39,11 +45,16 @@ def reduced_phase(
         (...) [rad].
     """
     cycles = distance.double() * (_double(frequency_hz, distance) / LIGHT)
+    # Whole turns have no slope, so that the gradient is that of the phase before they went.
     return ((cycles.detach().round() - cycles) * (2 * math.pi)).to(dtype)
 
 
 def wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
-    """`exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast."""
+    """Return `exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast.
+
+    >>> wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
+    tensor([0.5000, 0.2500])
+    """
     return torch.polar((1 / distance).to(dtype), reduced_phase(distance, frequency_hz, dtype))
 
 
@@ -52,11 +63,15 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
 
     Evenly spaced tones are factored into a coarse and a fine comb, `f = f_0 + (q M + p) df`: about
     2 sqrt(F) sines and cosines instead of F, and one product per tone; 1/r enters with the coarse comb.
+
+    >>> wave_over_band(torch.tensor([3.0, 5.0]), torch.linspace(2.40e9, 2.42e9, 64)).shape
+    torch.Size([2, 64])
     """
     frequency = _double(frequency_hz, distance)
     tones = len(frequency)
     if tones < 6 or not evenly_spaced(frequency):
         return wave(distance[..., None], frequency, dtype)
+    # The root of the number of tones, rounded up: both combs together are then as short as can be.
     fine = math.isqrt(tones - 1) + 1
     coarse = wave(distance[..., None], frequency[::fine], dtype)
     steps = frequency[:fine] - frequency[0]
@@ -66,7 +81,11 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
 
 
 def evenly_spaced(frequency: Tensor) -> bool:
-    """Whether tones (F,) [Hz] are a comb."""
+    """Tell whether tones (F,) [Hz] are a comb.
+
+    >>> evenly_spaced(torch.tensor([0.0, 1e6, 2e6])), evenly_spaced(torch.tensor([0.0, 1e6, 3e6]))
+    (True, False)
+    """
     step = frequency.diff()
     # A thousandth of a radian over a kilometre of range: 50 Hz
     return bool(((step - step.mean()).abs().cumsum(0) < 50.0).all())
