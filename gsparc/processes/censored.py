@@ -43,8 +43,13 @@ class Sites:
 
 
 def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Of a standard normal cut off above z (n,): minus its mean, and the share of its variance lost."""
+    """Return, of a standard normal cut off above z (n,), minus its mean, and the share of its variance lost.
+
+    >>> truncated(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
+    (tensor([0.7979]), tensor([0.6366]))
+    """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
+    # In logarithms: density and distribution underflow long before their ratio does.
     ratio = (-inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)).exp()
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
     remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
@@ -67,6 +72,7 @@ def propagate(
         factor = Factor.of(covariance + torch.diag(variance), "raise")
         precision = factor.precision
         weights = factor.solved((value - mean)[:, None])[:, 0]
+        # The cavity: what all others say of an entry, its own stand-in taken out.
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
         result, wide = _sites(cavity, cavity_variance, level, side)
@@ -74,6 +80,7 @@ def propagate(
         if settled:
             break
         before = cavity
+        # Damped in precision and precision times mean, which add where Gaussians multiply.
         both = (1 - DAMPING) / variance + DAMPING / wide
         value = ((1 - DAMPING) * value / variance + DAMPING * result / wide) / both
         variance = 1 / both
@@ -132,7 +139,11 @@ class ConditionalGaussian:
 def log_evidence(
     gram: Tensor, values: Tensor, side: Tensor, last: list[Sites] | None = None
 ) -> tuple[float, Tensor, Tensor]:
-    """Logarithm of the probability of known values and of the rest beyond their levels.
+    """Return the logarithm of the probability of known values and of the rest beyond their levels.
+
+    >>> gram, level = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    >>> round(math.exp(log_evidence(gram, level, torch.ones(2))[0]), 3)  # both below their mean
+    0.25
 
     Returns:
         It, its slopes by `gram`, and minus its slopes by values and levels.

@@ -21,6 +21,12 @@ from gsparc.processes.left_out import left_out, left_out_signal
 class Conditioned:
     """n rows of R outputs that share their covariance.
 
+    >>> rows = Conditioned.of(torch.tensor([[2.0, 1.0], [1.0, 2.0]]), torch.tensor([[3.0], [3.0]]))
+    >>> rows.mean(torch.tensor([[1.0, 1.0]])), rows.known(torch.tensor([[1.0, 1.0]]))
+    (tensor([[2.]]), tensor([0.6667]))
+    >>> rows.left_out()[0].T  # 3 less the 1.5 that the other row says
+    tensor([[1.5000, 1.5000]])
+
     Attributes:
         factor: of the covariance (n, n), noise included.
         values: (n, R) less their mean.
@@ -44,6 +50,7 @@ class Conditioned:
         """Negative log density up to a constant [nats]."""
         fit = (self.values.conj() * self.weights).real.double().sum()
         both = float(fit + self.values.shape[1] * self.factor.log_determinant)
+        # The log density of a circular complex Gaussian has no factor 1/2.
         return both if self.values.is_complex() else 0.5 * both
 
     @cached_property

@@ -50,6 +50,7 @@ class LeftOutDensity(torch.autograd.Function):
         count, inverse = len(values), Factor.of(gram.detach(), "raise").inverse
         ratio, share = inverse @ values, inverse.diagonal()
         squared = ratio.square().sum(1)
+        # Where the slope by the amplitude is 0: the mean of squared errors over their relative variances.
         amplitude = max(float((squared / share).sum()) / (count * entries), TINY)
         density = 0.5 * count * math.log(2 * math.pi * math.e * amplitude) - 0.5 * float(share.log().sum())
         least = float(values.square().sum()) / (count * entries) if bounded else amplitude
@@ -67,6 +68,7 @@ class LeftOutDensity(torch.autograd.Function):
         inverse, ratio, by_ratio = ctx.saved_tensors
         scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
         with BLAS.limit(limits=1):
+            # One triangle of a symmetric product: half the multiplications of all of it.
             lower = torch.from_numpy(blas.dsyrk(1.0, scaled.T, lower=0, trans=1)).T
         column = inverse @ by_ratio
         mixed = column @ ratio.T
@@ -112,7 +114,11 @@ class Profiled(torch.autograd.Function):
 
 
 def gram_of(parameters: Tensor, distance: Tensor, columns: Tensor | None = None) -> Tensor:
-    """Covariance (n, n) with noise, relative to the amplitude, differentiable in `Kernel.parameters()`.
+    """Return the covariance (n, n) with noise, of amplitude 1, differentiable in `Kernel.parameters()`.
+
+    >>> kernel = Kernel.of_one(length=2.0, noise=0.5)
+    >>> gram_of(torch.from_numpy(kernel.parameters()), torch.zeros(1, 1, dtype=torch.float64))
+    tensor([[1.5000]], dtype=torch.float64)
 
     Args:
         parameters: (2,) or (4,) float64.
@@ -133,7 +139,11 @@ def walked(
     looks: int,
     tolerance: float,
 ) -> tuple[np.ndarray, float]:
-    """Where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
+    """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
+
+    >>> best, value = walked(lambda at: (at - 3).square().sum(), [np.zeros(1)], [(-5.0, 5.0)], 50, 1e-12)
+    >>> best.round(3), round(value, 3)
+    (array([3.]), 0.0)
 
     Args:
         objective: of parameters (p,) float64, with autograd.

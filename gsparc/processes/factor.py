@@ -40,6 +40,14 @@ class NotPositiveDefiniteError(ValueError):
 class Factor:
     """`K = L L^H`.
 
+    >>> factor = Factor.of(torch.tensor([[4.0, 2.0], [2.0, 3.0]]))
+    >>> factor.solved(torch.tensor([[8.0], [7.0]])).T
+    tensor([[1.2500, 1.5000]])
+    >>> Factor.of(torch.tensor([[1.0, 2.0], [2.0, 1.0]]), failing="raise")
+    Traceback (most recent call last):
+        ...
+    gsparc.processes.factor.NotPositiveDefiniteError: a covariance is not positive definite
+
     Attributes:
         lower: L (..., n, n), real or complex.
     """
@@ -86,7 +94,7 @@ class Factor:
         )
 
     def whitened(self, values: Tensor) -> Tensor:
-        """`L^-1 V` of values (..., n, R)."""
+        """Return `L^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.whitened, values)
         values = values.to(self.lower.dtype)
@@ -107,10 +115,11 @@ class Factor:
     @cached_property
     def _rounded(self) -> list[Tensor]:
         root, step = self._inverted().float(), -(-len(self.lower) // BANDS)
+        # A band of rows ends at its diagonal: the zeros above are neither stored nor read.
         return [root[i : i + step, : i + step].contiguous() for i in range(0, len(root), step)]
 
     def solved(self, values: Tensor) -> Tensor:
-        """`K^-1 V` of values (..., n, R)."""
+        """Return `K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
             return as_pairs(self.solved, values)
         values = values.to(self.lower.dtype)
@@ -120,6 +129,7 @@ class Factor:
 
     def _triangular(self, values: Tensor, adjoint: bool) -> Tensor:
         """`L^-1 V`, or `L^-H V`."""
+        # The transpose of an array in C's order is one in Fortran's: LAPACK reads it without a copy.
         upper, right = _array(self.lower).T, np.ascontiguousarray(_array(values))
         trsm = get_blas_funcs("trsm", (upper,))
         with BLAS.limit(limits=1):
@@ -148,11 +158,13 @@ class Factor:
         """Diagonal (..., n) of `K^-1`, real; without forming the rest."""
         if "inverse" in vars(self):
             return self.inverse.diagonal(dim1=-2, dim2=-1).real
+        # diag(L^-H L^-1) is the squared length of each column of L^-1.
         return self.root.abs().square().sum(-2)
 
     @cached_property
     def log_determinant(self) -> Tensor:
         """Of K (...), float64."""
+        # In float64: a sum of thousands of logarithms loses digits in float32.
         return 2 * self.lower.diagonal(dim1=-2, dim2=-1).real.double().log().sum(-1)
 
 

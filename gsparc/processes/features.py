@@ -25,7 +25,10 @@ LEAST = 1e-12  # eigenvalue below which a feature is none
 
 
 def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tensor:
-    """Correlations (A, B) of unit variance between positions (A, 3) and (B, 3) [m].
+    """Return correlations (A, B) of unit variance between positions (A, 3) and (B, 3) [m].
+
+    >>> correlation(torch.zeros(1, 3), torch.tensor([[2.0, 0.0, 0.0]]), 2.0, "matern32")
+    tensor([[0.4834]])
 
     Raises:
         ValueError: another name.
@@ -60,7 +63,12 @@ class Whitened:
 
 
 def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most: int) -> Whitened:
-    """Features of a process conditioned on rows (n, 3) [m], at `most` places; exact up to that many rows.
+    """Return features of a process conditioned on rows (n, 3) [m], at `most` places; exact up to that many.
+
+    >>> rows = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    >>> known = whitened(rows, length=2.0, noise=0.01, name="matern32", most=10)
+    >>> known.places.shape, known.whitening.shape, known.weigh.shape
+    (torch.Size([2, 3]), torch.Size([2, 2]), torch.Size([2, 2]))
 
     Args:
         rows: float64.
@@ -73,6 +81,7 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
         gram = correlation(rows, rows, length, name)
         gram.diagonal().add_(noise)
         root = Factor.of(gram).root
+        # C = L^-T, as C C^T is to be the inverse of the covariance.
         return Whitened(rows, root.T.contiguous(), root)
     return with_places(rows[farthest(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name)
 
@@ -93,10 +102,14 @@ def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name:
 
 
 def farthest(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
-    """Indices of up to `most` rows (n, 3), each the one that those before it tell least about.
+    """Return indices of up to `most` rows (n, 3), each the one that those before it tell least about.
 
     It ends when every row's variance given these is at most `enough`: a pivoted Cholesky factorization (Fine
     and Scheinberg 2001), n times the square of their number in time.
+
+    >>> rows = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    >>> farthest(rows, length=2.0, enough=0.0, name="matern32", most=2)
+    tensor([0, 2])
     """
     most = min(most, len(rows))
     left, factor = torch.ones(len(rows), dtype=rows.dtype), rows.new_zeros(most, len(rows))

@@ -22,31 +22,46 @@ ONE = torch.ones(())  # a number would cost each operation of a single query as 
 
 
 def apart(a: Tensor, b: Tensor) -> Tensor:
-    """Distances (..., n, m) [m] of places (..., n, D) and (..., m, D); exact at none, and differentiable.
+    """Return distances (..., n, m) [m] of places (..., n, D) and (..., m, D), with gradients; exact at 0.
 
     Differences are formed before squaring: the expanded form loses millimetres in float32.
+
+    >>> apart(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
+    tensor([[5.]])
     """
     if not beyond_kernels(a, b):
         return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     squared = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)  # `cdist` has no forward mode
     none = squared == 0
+    # The inner `where` keeps the root's slope at 0, which is infinite, out of the gradient.
     return torch.where(none, 0.0, torch.where(none, 1.0, squared).sqrt())
 
 
 def matern32(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Matern-3/2 of distances (...) [m]."""
+    """Return the Matern-3/2 correlation of distances (...) [m].
+
+    >>> matern32(torch.tensor([0.0, 2.0]), length=2.0)
+    tensor([1.0000, 0.4834])
+    """
+    # Rasmussen and Williams 2006, eq. 4.17: (1 + s) exp(-s) with s = sqrt(3) d / length.
     scaled = distance * (-math.sqrt(3) / length)
     return torch.sub(ONE, scaled) * scaled.exp()
 
 
 def matern32_of_squares(squared: Tensor) -> Tensor:
     """Matern-3/2 of squared distances (...) in units of the length, with a slope where they are 0."""
+    # What is added keeps the slope of the root finite where two places are one.
     root = (3 * squared + 1e-9).sqrt()
     return (1 + root) * torch.exp(-root)
 
 
 def matern52(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Matern-5/2 of distances (...) [m]."""
+    """Return the Matern-5/2 correlation of distances (...) [m].
+
+    >>> matern52(torch.tensor([0.0, 2.0]), length=2.0)
+    tensor([1.0000, 0.5240])
+    """
+    # The same equation: (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) d / length.
     scaled = distance * (-math.sqrt(5) / length)
     return torch.addcmul(torch.sub(ONE, scaled), scaled, scaled, value=1 / 3) * scaled.exp()
 
@@ -54,7 +69,11 @@ def matern52(distance: Tensor, length: Tensor | float) -> Tensor:
 def matern_sum(
     distance: Tensor, lengths: Sequence[Tensor | float], shares: Sequence[Tensor | float]
 ) -> Tensor:
-    """Sum of Matern-3/2 at distances (...) [m]."""
+    """Return the sum of Matern-3/2 correlations of several lengths [m] at distances (...) [m].
+
+    >>> matern_sum(torch.tensor([0.0, 2.0]), lengths=(2.0, 20.0), shares=(0.5, 0.5))
+    tensor([1.0000, 0.7350])
+    """
     if len(lengths) == 1:
         return matern32(distance, lengths[0])
     parts = zip(lengths, shares, strict=True)
@@ -69,6 +88,12 @@ def smooth_rough(distance: Tensor, length: float) -> Tensor:
 @dataclass(frozen=True)
 class Kernel:
     """`amplitude (sum_k share_k Matern-3/2(distance / length_k) + noise identity)`.
+
+    >>> kernel = Kernel(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
+    >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))  # one place: its variance and that of the noise
+    tensor([[1.1000]], dtype=torch.float64)
+    >>> Kernel.of(kernel.parameters()).parameters().round(3).tolist() == kernel.parameters().round(3).tolist()
+    True
 
     Attributes:
         lengths: one or two [m].
@@ -92,11 +117,11 @@ class Kernel:
         return matern_sum(distance, self.lengths, self.shares)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
+        """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
         return self.correlation(apart(a, b))
 
     def gram(self, places: Tensor) -> Tensor:
-        """Correlations (n, n) with noise of places (n, D) [m]."""
+        """Return correlations (n, n) with noise of places (n, D) [m]."""
         result = self.between(places, places)
         result.diagonal().add_(self.noise)
         return result
@@ -119,7 +144,7 @@ class Kernel:
         return cls(lengths, shares, *(float(v) for v in state["kernel"]))
 
     def parameters(self) -> np.ndarray:
-        """Logarithms of lengths and noise, between them the logit of the first share where there are two."""
+        """Return logarithms of lengths and noise, between them the logit of the first share of two."""
         logit = [math.log(self.shares[0] / self.shares[1])] if len(self.shares) == 2 else []
         return np.array([*np.log(self.lengths), *logit, math.log(self.noise)])
 
@@ -137,6 +162,10 @@ class WaveKernel:
     Where both ends move it is the product over both, as waves leave in all directions as they arrive from all
     (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
 
+    >>> kernel = WaveKernel(wavenumber=2 * math.pi, length=1e6)  # of 1 m wavelength
+    >>> kernel.between(torch.zeros(1, 3), torch.tensor([[0, 0, 0.75], [0.25, 0, 0]])).round(decimals=3)
+    tensor([[-0.2120,  0.6370]])
+
     Attributes:
         wavenumber: [rad/m].
         length: of the envelope [m].
@@ -152,6 +181,7 @@ class WaveKernel:
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Correlations (..., n, m) of places (..., n, 3) and (..., m, 3) of one end, or 6 of both [m]."""
         ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
+        # `torch.sinc` has pi in its argument: sin(pi x) / (pi x).
         waves = [
             torch.sinc(each * (self.wavenumber / math.pi)) * matern32(each, self.length) for each in ends
         ]
@@ -184,7 +214,12 @@ def unpacked(parameters: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
 
 
 def bounds_of(count: int, distance: np.ndarray) -> list[tuple[float, float]]:
-    """Of the parameters of a kernel of `count` lengths, for rows at such distances (...) [m]."""
+    """Return bounds of the parameters of a kernel of `count` lengths, for rows at distances (...) [m].
+
+    >>> [round(low, 2) for low, high in bounds_of(1, np.array([10.0]))]  # logarithms of length and noise
+    [-4.61, -13.82]
+    """
+    # All rows may stand at one place, whose distances are 0.
     scale = float(np.median(distance)) or float(distance.max()) or 1.0
     length = (math.log(scale * LENGTH_SPAN[0]), math.log(scale * LENGTH_SPAN[1]))
     share = [(-SHARES, SHARES)] if count == 2 else []

@@ -20,7 +20,12 @@ ENTRIES = 2_000_000  # of systems solved at a time: memory
 def left_out(
     inverse: Tensor, weights: Tensor, groups: Iterable[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Residuals, shaped as the weights, and their variances (n,).
+    """Return residuals, shaped as the weights, and their variances (n,).
+
+    >>> inverse = torch.tensor([[2.0, 1.0], [1.0, 2.0]]).inverse()
+    >>> residual, variance = left_out(inverse, inverse @ torch.tensor([[3.0], [3.0]]))
+    >>> residual.T, variance
+    (tensor([[1.5000, 1.5000]]), tensor([1.5000, 1.5000]))
 
     Args:
         inverse: `K^-1` (n, n), or its diagonal (n,) where rows are left out one by one.
@@ -90,5 +95,9 @@ def left_out_signal(
 
 
 def groups_of(number: np.ndarray) -> list[Tensor]:
-    """Rows of each group by their numbers (n,)."""
+    """Return the rows of each group by their numbers (n,).
+
+    >>> groups_of(np.array([7, 3, 7]))
+    [tensor([1]), tensor([0, 2])]
+    """
     return [torch.from_numpy(np.flatnonzero(number == one)) for one in np.unique(number)]

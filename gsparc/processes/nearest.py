@@ -65,6 +65,10 @@ def weights_of(
 class Values:
     """Places, each once, and what was measured there.
 
+    >>> values = Values.of(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
+    >>> values.values, values.count  # two rows of one place
+    (tensor([[2.]], dtype=torch.float64), tensor([2.], dtype=torch.float64))
+
     Attributes:
         places: (n, D) float64 [m].
         values: (n, P) mean over the rows of a place.
@@ -210,7 +214,13 @@ def given(
     extra: Tensor | None = None,
     most: int = NEIGHBOURS,
 ) -> Nearest:
-    """The process given places, with settings as they are.
+    """Return the process given places, with settings as they are.
+
+    >>> line = np.linspace(0.0, 9.0, 10)[:, None]
+    >>> values = Values.of(line, torch.from_numpy(np.sin(line)))
+    >>> posterior = given(Prior(Kernel.of_one(3.0, 1e-4)), values, seed=0, most=4)
+    >>> posterior.approximation, posterior.answer(torch.tensor([[4.5]], dtype=torch.float64)).mean.shape
+    ('Vecchia 4', torch.Size([1, 1]))
 
     Args:
         prior: see there.
@@ -263,6 +273,7 @@ def weighed(
     white = [Factor.of(gram, "raise").whitened(both[:first])]
     start = first
     while start < len(places):
+        # The tree of the rows so far serves as many again: few trees for any number of rows.
         tree, end = cKDTree(places[:start]), min(2 * start, len(places))
         for a in range(start, end, WHITENED):
             block = slice(a, min(a + WHITENED, end))

@@ -22,9 +22,12 @@ HALVINGS = 40  # of the side of cells, each a look at all rows
 
 
 def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
-    """At most so many rows, sorted: one drawn in each of as many cubic cells of one side, the rest at random.
+    """Draw at most so many rows, sorted: one in each of as many cubic cells of one side, the rest at random.
 
     A vehicle that stood for an hour counts no more than a place that it drove by. Time is linear in n.
+
+    >>> covering(np.array([[0.0], [0.1], [0.2], [50.0], [100.0]]), most=3, seed=0).shape
+    (3,)
 
     Args:
         places: (n, D) [m].
@@ -38,6 +41,7 @@ def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
     mixing = np.random.default_rng(0).integers(1, 2**62, places.shape[1])
     fine, coarse, first = 0.0, size * 2, order[:1]
     for _ in range(HALVINGS):
+        # Bisection: the larger the cells are, the fewer rows are drawn.
         side = fine + (coarse - fine) / 2
         cells = np.floor((places[order] - low) / side).astype(np.int64)
         number = cells @ mixing  # of each cell its own, but for collisions of no weight
@@ -57,6 +61,10 @@ class Neighbourhood:
     """Places in sets that are ever sparser and cover the site.
 
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
+
+    >>> line = np.linspace(0, 100, 11)[:, None]  # every 10 m
+    >>> Neighbourhood.of(line, seed=0).nearest(np.array([[41.0]]), most=2).tolist()
+    [[4, 5]]
 
     Attributes:
         places: (n, D) [m].
@@ -107,10 +115,12 @@ class Neighbourhood:
             most: neighbours.
         """
         result: list[np.ndarray] = []
+        # One more is looked for, as the place itself is among the nearest.
         more = 0 if without is None else 1
         for (own, count), (_, tree) in zip(self.shares(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
+                # A stable sort puts the place itself last and keeps the others from near to far.
                 later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row = np.take_along_axis(row, later, 1)
             result.append(row)

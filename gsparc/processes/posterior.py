@@ -28,6 +28,13 @@ MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many o
 class Exact(Posterior):
     """Given n rows with one factor.
 
+    >>> prior = Prior(Kernel.of_one(length=2.0, noise=0.01))
+    >>> places = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)  # on a line [m]
+    >>> posterior = Exact.of(prior, places, places.sin())
+    >>> answer = posterior.answer(torch.tensor([[1.0], [90.0]], dtype=torch.float64))
+    >>> answer.mean[:, 0].round(decimals=1), answer.left.round(decimals=1)  # at a row, and far away
+    (tensor([0.8000, 0.0000], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
+
     Attributes:
         prior: see there.
         rows: (n, D) float64 [m].
@@ -73,6 +80,7 @@ class Exact(Posterior):
         if self._near is not None:
             return Answer(self._mean(queries, cross), self._near.answer(queries).left.minimum(prior))
         known = self.factor.whitened(cross.T).square().sum(0)
+        # Rounding may leave a variance below 0 at a row's place.
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
 
     @cached_property

@@ -31,6 +31,10 @@ REACH = 0.25  # diagonals of the known places, by which a law's confidence falls
 class Rows:
     """Powers and where they were measured.
 
+    >>> rows = Rows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
+    >>> rows.silent, len(rows.loud.decibels)  # the second lies below its level
+    (array([False,  True, False]), 2)
+
     Attributes:
         places: (n, 3) of the moving end, or (n, 6) of both [m].
         decibels: (n,) powers, or levels [dB].
@@ -61,7 +65,11 @@ class Rows:
 
 
 def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
-    """At most so many rows, sorted; at least half of them were heard where as many were."""
+    """Draw at most so many rows, sorted; at least half of them were heard where as many were.
+
+    >>> len(draw(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
+    8
+    """
     rng = np.random.default_rng(seed)
     loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
     if len(loud) + len(quiet) > most:
@@ -184,10 +192,16 @@ class PowerProcess:
 
 
 def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Mean and variance (n,) of a mixture of (share, mean, variance), with what members disagree about."""
+    """Return mean and variance (n,) of a mixture of (share, mean, variance), disagreement of means included.
+
+    >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
+    >>> averaged([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
+    (tensor([-75.]), tensor([29.]))
+    """
     if len(parts) == 1:
         return parts[0][1:]
     mean = sum((share * one for share, one, _ in parts), torch.zeros_like(parts[0][1]))
+    # The law of total variance: within the members, and between their means.
     spread = [share * (variance + (one - mean).square()) for share, one, variance in parts]
     return mean, torch.stack(spread).sum(0)
 

@@ -74,9 +74,11 @@ class Sectors(Trend):
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
         away = places[:, :3] - places[:, 3:6]
         flat = away[:, :2].norm(dim=1).clamp_min(1e-3)
+        # From north and clockwise, as azimuths of sectors are given.
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
         down = torch.rad2deg(torch.atan2(-away[:, 2], flat))
         turn, lean, wide = torch.zeros(3, 1) if own is None else own.unsqueeze(-1).unbind(-2)
+        # Brought into [-180, 180): a sector to the north sees both sides of 0.
         across = torch.remainder(bearing - azimuth - turn + 180, 360) - 180
         across = 12 * (across / (width * torch.exp(wider + wide))).square()
         over = 12 * ((down - tilt - tilted - lean) / (height * torch.exp(higher))).square()
@@ -159,6 +161,7 @@ class Pairs:
     def of(cls, a: Tensor, b: Tensor) -> Pairs:
         """Of places (..., n, 7) and (..., m, 7)."""
         towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
+        # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
         return cls(apart(a[..., :3], b[..., :3]), (a[..., 6:] == b[..., 6:].mT).to(a), alike)
 

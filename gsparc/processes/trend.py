@@ -21,6 +21,10 @@ LEVEL = 0.7  # upward part of a floor's normal
 class Law:
     """`P [dB] = level - 10 exponent log10(max(distance, floor))`.
 
+    >>> law = Law(level=-40.0, exponent=2.0, floor=1.0, scale=6.0, place=(0.0, 0.0, 0.0))
+    >>> law.mean(torch.tensor([[10.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))  # at 10 m, and nearer than the floor
+    tensor([-60., -40.])
+
     Attributes:
         level: at 1 m [dB of stored units].
         exponent: n.
@@ -39,6 +43,7 @@ class Law:
         """log10 of the distance in metres, floored, (n,) at places (n, 3), or of both ends (n, 6) [m]."""
         still = places[:, 3:6] if self.place is None else places.new_tensor(self.place)
         squared = (places[:, :3] - still).square().sum(1)
+        # Half the logarithm of the square: the root, whose slope at 0 is infinite, is never taken.
         return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
 
     def mean(self, places: Tensor) -> Tensor:
@@ -61,6 +66,13 @@ def law_of_state(state: dict[str, Any]) -> Law | None:
 class Walls:
     """Q rectangles, boxes as six each.
 
+    >>> axes = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]])  # normal along x
+    >>> corner, size = torch.tensor([[2.0, 0, 0]]), torch.tensor([[4.0, 3.0]])
+    >>> wall = Walls(axes, corner, size, still=torch.tensor([0, 1.0, 1.0]))
+    >>> wall.crossed(torch.tensor([[5.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))  # behind the wall x = 2, and before it
+    tensor([[1., 0.],
+            [0., 0.]])
+
     Attributes:
         axes: (Q, 3, 3) float64, of each its normal and two tangents.
         corners: (Q, 3) lowest coordinates along these [m].
@@ -81,6 +93,7 @@ class Walls:
             for at in (places[:, :3], other)
         )
         apart = (start - end)[..., :1]
+        # Where a path meets the wall's plane; a path along the plane is divided by 1, and never counts.
         met = start + start[..., :1] / torch.where(apart == 0, 1.0, apart) * (end - start)
         inside = ((met[..., 1:] >= 0) & (met[..., 1:] <= self.sizes)).all(-1)
         hit = (inside & (start[..., 0] * end[..., 0] < 0)).to(places)
@@ -91,6 +104,9 @@ class Walls:
 @dataclass(frozen=True)
 class Trend:
     """The mean of powers, and what of it is uncertain.
+
+    >>> Trend(level=-70.0).mean(torch.zeros(2, 3))
+    tensor([-70., -70.])
 
     Attributes:
         level: the mean where there is no law [dB].

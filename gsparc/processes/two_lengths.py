@@ -24,7 +24,11 @@ LOOKS, SETTLED = 8, 1e-4
 
 
 def first_kernel(length: float) -> Kernel:
-    """Before anything was learned; `length` is a wavelength, or what stands for it [m]."""
+    """Return the kernel before anything was learned; `length` is a wavelength, or what stands for it [m].
+
+    >>> [round(length, 3) for length in first_kernel(0.1).lengths]
+    [0.037, 0.28]
+    """
     return Kernel((START[0] * length, START[1] * length), (0.5, 0.5), 0.01)
 
 

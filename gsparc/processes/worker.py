@@ -38,7 +38,14 @@ def raise_if_cancelled() -> None:
 
 
 def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Within, `late` says what `over`, or who surrounds it, says, in this thread."""
+    """Within, `late` says what `over`, or who surrounds it, says, in this thread.
+
+    >>> with late_when(lambda: True):
+    ...     late()
+    True
+    >>> late()
+    False
+    """
     return _within("over", over)
 
 
