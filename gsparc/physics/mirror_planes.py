@@ -41,7 +41,7 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
 def images(
     transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]
 ) -> Tensor:
-    """Return positions (..., K, 3) [m] of sequences, with gradients by transmitter (..., 3) and planes (P, 4).
+    """Return positions (..., K, 3) [m] of sequences, differentiable in transmitter (..., 3), planes (P, 4).
 
     >>> planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 5.0]])  # the floor, and a wall x = 5
     >>> images(torch.tensor([1.0, 2.0, 3.0]), planes, [(0,), (0, 1)])
