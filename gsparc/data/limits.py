@@ -45,13 +45,25 @@ class Limit:
 
 
 def whole(least: int, most: int | None = None) -> Limit:
-    """A whole number from `least`."""
+    """Allow a whole number from `least`.
+
+    >>> whole(1, 8).words
+    'a whole number of at least 1 and at most 8'
+    >>> whole(1, 8).holds(3), whole(1, 8).holds(True)
+    (True, False)
+    """
     words = f"a whole number of at least {least}" + ("" if most is None else f" and at most {most}")
     return Limit(words, lambda v: type(v) is int and v >= least and (most is None or v <= most))
 
 
 def number(low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False) -> Limit:
-    """A finite number between `low` and `high`."""
+    """Allow a finite number between `low` and `high`.
+
+    >>> number(0, 1, open_low=True).check("share", 0)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: share=0: a number above 0 and at most 1 is needed
+    """
     words = f"a number {'above' if open_low else 'of at least'} {low:g}" if low > -math.inf else "a number"
     words += "" if high == math.inf else f" and {'below' if open_high else 'at most'} {high:g}"
     return Limit(
@@ -61,23 +73,37 @@ def number(low: float, high: float = math.inf, *, open_low: bool = False, open_h
 
 
 def choice(*values: str) -> Limit:
-    """One of a few words."""
+    """Allow one of a few words.
+
+    >>> choice("random", "blocks").check("name", "blok")
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: name='blok': one of random, blocks is needed; did you mean 'blocks'?
+    """
     return Limit(f"one of {', '.join(values)}", lambda v: v in values, values)
 
 
 def switch(*more: str) -> Limit:
-    """True, false, or one of a few words."""
+    """Allow true, false, or one of a few words."""
     words = ("true", "false", *more)
     return Limit(f"one of {', '.join(words)}", lambda v: isinstance(v, bool) or v in more, words)
 
 
 def or_word(limit: Limit, word: str) -> Limit:
-    """The same, or a word."""
+    """Allow the same, or a word.
+
+    >>> or_word(whole(1), "auto").words
+    'a whole number of at least 1, or auto'
+    """
     return Limit(f"{limit.words}, or {word}", lambda v: v == word or limit.holds(v), (*limit.known, word))
 
 
 def or_null(limit: Limit) -> Limit:
-    """The same, or nothing."""
+    """Allow the same, or nothing.
+
+    >>> or_null(number(0)).holds(None)
+    True
+    """
     return Limit(f"{limit.words}, or null", lambda v: v is None or limit.holds(v), limit.known)
 
 
@@ -90,7 +116,11 @@ def _real(value: Any) -> bool:
 
 
 def finite(numbers: Any) -> np.ndarray:
-    """Numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite."""
+    """Return numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite.
+
+    >>> finite([[1, 2.5]]), finite([1.0, "2"])
+    (array([[1. , 2.5]]), array([], dtype=float64))
+    """
     try:
         boxed = np.array(numbers, dtype=object)
     except ValueError:  # rows of different lengths
@@ -109,7 +139,16 @@ def internal(default: Any) -> Any:
 
 
 class Checked:
-    """A dataclass that refuses, with `SettingError`, what its fields' limits do not allow."""
+    """A dataclass that refuses, with `SettingError`, what its fields' limits do not allow.
+
+    >>> @dataclass
+    ... class Search(Checked):
+    ...     steps: int = setting(500, whole(1))
+    >>> Search(steps=0)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: steps=0: a whole number of at least 1 is needed
+    """
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]

@@ -87,6 +87,11 @@ class Links:
 class Site:
     """The fixed facts of a measurement campaign.
 
+    >>> box = np.array([[0.0, 0.0, 1.5], [9.0, 9.0, 1.5]])
+    >>> site = Site("hall", "rssi", "tx", None, None, 2.4e9, None, np.zeros(3), box, box, sha256="")
+    >>> site.moving_end, round(site.wavelength, 4), site.query_box.shape  # the receiver moves
+    ('rx', 0.1249, (2, 3))
+
     Attributes:
         name: dataset name as it appears in every log and summary.
         kind: what a target is: `spectrum` (H, W) in [0, 1]; `csi` (antennas, subcarriers) complex;
@@ -230,6 +235,13 @@ class Site:
 class Measurements:
     """A whole dataset, in memory but for large targets; arrays keep their stored precision and type.
 
+    >>> predictor.site.name, predictor.site.kind  # facts of what a model learned from
+    ('gsparc', 'rssi')
+    >>> ends, turned = np.zeros((4, 3)), np.zeros((4, 3, 3))
+    >>> data = Measurements(predictor.site, ends, ends, turned, target=np.ones((4, 1), np.float32))
+    >>> data.batch([1, 3]).target.shape, data.moving.shape
+    (torch.Size([2, 1]), (4, 3))
+
     Attributes:
         site: the fixed facts.
         tx: (S, 3) float64 [m], local coordinates.
@@ -287,12 +299,12 @@ class Measurements:
         return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
-        """Targets of the given rows as float32 or complex64, in stored units."""
+        """Return targets of the given rows as float32 or complex64, in stored units."""
         chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))
         return chosen.float() / 255 if chosen.dtype == torch.uint8 else chosen
 
     def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
-        """Rows (n,) alone, seen as measurements of `site`."""
+        """Return rows (n,) alone, seen as measurements of `site`."""
 
         def of(value: Any) -> Any:
             return [value[i] for i in rows] if isinstance(value, list) else take(value, rows)
@@ -303,7 +315,7 @@ class Measurements:
         return Measurements(site=site or self.site, provenance=self.provenance, **parts)
 
     def batch(self, index: np.ndarray | Tensor) -> Batch:
-        """The given rows as one batch."""
+        """Return the given rows as one batch."""
         rows = np.asarray(index)
         if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
             first = rows[:1]
@@ -362,6 +374,10 @@ NORMALISATIONS = ("max", "minmax", "power", "none")
 
 
 def axes_from(letter: str) -> dict[str, set[int]]:
-    """Arrays that may have a row per sample (S), station (T) or path (P), and then their numbers of axes."""
+    """Arrays that may have a row per sample (S), station (T) or path (P), and then their numbers of axes.
+
+    >>> axes_from("T")["carrier_hz"]  # a frequency for each station
+    {1}
+    """
     shapes = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}
     return {name: {1 + len(re.findall(r"\w+", s)) for s in rest} for name, rest in shapes.items() if rest}

@@ -58,6 +58,10 @@ class Fold:
 class Split:
     """One fold, or several whose test results are pooled.
 
+    >>> places = np.random.default_rng(0).uniform(0, 9, (100, 3))
+    >>> make_split(places, SplitSettings()).sha256 == make_split(places, SplitSettings(seed=1)).sha256
+    False
+
     Attributes:
         name: one of `NAMES`, or a file's.
         folds: one or more folds.
@@ -93,6 +97,11 @@ KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*
 @dataclass(frozen=True)
 class SplitSettings(Checked):
     """How to split; one instance of the config group `split`.
+
+    >>> SplitSettings(test_fraction=1.5)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
 
     Attributes:
         name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations` or `runs`.
@@ -170,6 +179,13 @@ def make_split(
 ) -> Split:
     """Split rows by the positions of the moving end; what is held out is so for all stations.
 
+    >>> places = np.random.default_rng(0).uniform(0, 9, (100, 3))
+    >>> fold = make_split(places, SplitSettings("random")).folds[0]
+    >>> len(fold.train), len(fold.val), len(fold.test)
+    (72, 8, 20)
+    >>> [len(fold.test) for fold in make_split(places, SplitSettings("grouped", folds=4)).folds]
+    [25, 25, 25, 25]
+
     Args:
         positions: (S, 3) [m] of the moving end, or (S, 6) of both; squares are counted from zero.
         settings: how.
@@ -222,10 +238,13 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
 
 
 def usual_step(positions: np.ndarray) -> float:
-    """Median distance [m] from a place (n, D) to the nearest other; 0 where too few places tell it.
+    """Return the median distance [m] from a place (n, D) to the nearest other; 0 where too few tell it.
 
     Looked for from coarse to fine, as all places may have been visited again: what lies in a cell is one, and
     the first step that is ten cells long stands.
+
+    >>> round(usual_step(np.c_[np.arange(20.0), np.zeros(20)]), 3)  # along a line, every metre
+    1.0
     """
     side = extent = float(np.ptp(positions, axis=0).max())
     while side > 1e-12 * extent:
@@ -240,7 +259,11 @@ def usual_step(positions: np.ndarray) -> float:
 
 
 def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
-    """The place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
+    """Return the place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
+
+    >>> line = np.c_[np.arange(20.0), np.zeros(20)]  # every metre, and once more 1 mm beside it
+    >>> visits(np.r_[line, line + 1e-3])[[0, 1, 20, 21]].tolist()
+    [0, 1, 0, 1]
 
     Args:
         positions: (S, D) [m].
@@ -275,12 +298,19 @@ def tenth(floor: np.ndarray) -> float:
 
 
 def square_of(floor: np.ndarray, side: float) -> np.ndarray:
-    """The number (n,) of the square of `side` [m] that each place (n, 2) is in, counted from zero."""
+    """Return the number (n,) of the square of `side` [m] that each place (n, 2) is in, from zero.
+
+    >>> square_of(np.array([[0.5, 0.5], [0.9, 0.1], [3.5, 0.5]]), side=1.0)
+    array([0, 0, 1])
+    """
     return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
-    """The rows (n,) int64 of `rows` that `leave_out` names, where `outliers` (n,) are those of that name.
+    """Return the rows (n,) int64 of `rows` that `leave_out` names, `outliers` (n,) being those of that name.
+
+    >>> left_out([3, 17], None, rows=20)
+    array([ 3, 17])
 
     Raises:
         DataError: there is no such row.
@@ -293,17 +323,20 @@ def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.
 
 
 def without(split: Split, absent: np.ndarray) -> Split:
-    """The same folds without the rows `absent` (n,)."""
+    """Return the same folds without the rows `absent` (n,)."""
     folds = tuple(fold.each(lambda part: np.setdiff1d(part, absent)) for fold in split.folds)
     return Split(split.name, folds, indices_hash(folds))
 
 
 def path_order(positions: np.ndarray) -> np.ndarray:
-    """Rows (S,) in the order of the measuring path.
+    """Return the rows (S,) in the order of the measuring path.
 
     Rows taken one after the other keep their order. Where consecutive rows are far apart compared with
     nearest neighbours (a shuffled file, random drops) there is no path: rows are ordered along the
     longest side of the box, so that a stretch becomes a slab.
+
+    >>> path_order(np.array([[0.0, 0, 0], [9, 0, 0], [1, 0, 0], [8, 0, 0], [2, 0, 0]]))  # no path: along x
+    array([0, 2, 4, 3, 1])
     """
     rows = np.arange(len(positions))
     if len(positions) < 3:
@@ -317,7 +350,12 @@ def path_order(positions: np.ndarray) -> np.ndarray:
 
 
 def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
-    """Those `rows` that are more than `distance` [m] away from all `others` (rows)."""
+    """Return those `rows` that are more than `distance` [m] away from all `others` (rows).
+
+    >>> line = np.arange(5.0)[:, None]
+    >>> far_from(line, np.array([0, 1, 2]), np.array([4]), distance=2.5)
+    array([0, 1])
+    """
     if len(rows) == 0 or len(others) == 0:
         return rows
     return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
@@ -326,7 +364,13 @@ def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distan
 def far_apart(
     positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
 ) -> np.ndarray:
-    """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
+    """Return a largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m].
+
+    >>> line = np.arange(9.0)[:, None]
+    >>> rows = far_apart(line, np.arange(9), distance=2.0, seed=[0])
+    >>> bool(np.diff(rows).min() > 2)
+    True
+    """
     tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
     subset = []
     for i in np.random.default_rng(seed).permutation(len(rows)):
@@ -337,7 +381,7 @@ def far_apart(
 
 
 def indices_hash(folds: tuple[Fold, ...]) -> str:
-    """SHA-256 of all indices of all folds."""
+    """Return the SHA-256 of all indices of all folds."""
     digest = hashlib.sha256()
     for fold in folds:
         for part in vars(fold).values():
