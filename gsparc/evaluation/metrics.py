@@ -80,7 +80,14 @@ class SampleMetric(Metric):
 
 
 class SpectrumMetrics(SampleMetric):
-    """Spectra (B, H, W) in [0, 1]: SSIM in both windows, PSNR, MSE, MAE, NMSE."""
+    """Spectra (B, H, W) in [0, 1]: SSIM in both windows, PSNR, MSE, MAE, NMSE.
+
+    >>> metric = SpectrumMetrics()
+    >>> metric.update(torch.full((2, 16, 16), 0.4), torch.full((2, 16, 16), 0.5))
+    >>> figures = metric.summary(metric.compute())
+    >>> round(figures["psnr_db"], 2), round(figures["mae"], 3), figures["samples"]
+    (20.0, 0.1, 2)
+    """
 
     quantities = ("ssim", "ssim_gauss", "psnr_db", "mse", "mae", "target_power")
 
@@ -115,6 +122,12 @@ class ChannelMetrics(SampleMetric):
     """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
 
     `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
+
+    >>> metric, channel = ChannelMetrics(), torch.tensor([[[1 + 0j, 1j]]])
+    >>> metric.update(0.9 * channel, channel)
+    >>> figures = metric.summary(metric.compute())
+    >>> round(figures["snr_db"], 2), round(figures["nmse"], 4), round(figures["nmse_scalar"], 4)
+    (20.0, 0.01, 0.0)
     """
 
     quantities: tuple[str, ...] = (
@@ -128,6 +141,7 @@ class ChannelMetrics(SampleMetric):
         p, t, count = np.where(m, p, 0), np.where(m, t, 0), _nonzero(m.sum(1))
         error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
         own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
+        # The projection onto the prediction: what the best complex scalar explains of the channel.
         explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
         # One free scalar fits a single-entry channel exactly: the figure is undefined there.
         left = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
@@ -173,6 +187,7 @@ class AlignedChannelMetrics(ChannelMetrics):
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.abs().double().flatten(1).numpy() for x in (prediction, target))
         known = t > 0 if mask is None else (t > 0) & mask.flatten(1).numpy()
+        # SILENCE is a share of power, levels here are amplitudes.
         floor = SILENCE**0.5 * np.where(known, t, 1.0)
         decibels = 20 * np.log10(np.maximum(p, floor) / np.where(known, t, 1.0))
         squares = np.where(known, decibels**2, 0).sum(1) / _nonzero(known.sum(1))
@@ -192,6 +207,11 @@ class PowerMetrics(SampleMetric):
 
     A prediction at or below zero is taken as the weakest power measured in the scored set, and counted; a
     target at or below zero has no decibels and is left out of the dB figures.
+
+    >>> metric = PowerMetrics()
+    >>> metric.update(torch.tensor([[1e-7], [1e-8]]), torch.tensor([[1e-7], [1e-9]]))
+    >>> round(metric.summary(metric.compute())["mae_db"], 3)  # 0 dB and 10 dB
+    5.0
     """
 
     quantities = ("prediction", "target")
@@ -205,6 +225,7 @@ class PowerMetrics(SampleMetric):
         raw = super().compute()
         p, t = raw["prediction"], raw["target"]
         positive = t > 0
+        # A power of 0 or less has no decibels: it counts as the weakest that was measured.
         floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
         error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
         error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
@@ -236,12 +257,20 @@ METRICS: dict[Scored, type[SampleMetric]] = {
 
 
 def metrics_for(kind: Scored, scale: float = 1.0) -> SampleMetric:
-    """The metrics of what a site is scored by (`Site.scored`); `scale` is `Site.target_scale`."""
+    """Return the metrics of what a site is scored by (`Site.scored`); `scale` is `Site.target_scale`.
+
+    >>> type(metrics_for("csi")).__name__
+    'ChannelMetrics'
+    """
     return METRICS[kind](scale)
 
 
 def figure_names(kind: Scored) -> tuple[str, ...]:
-    """The figures of merit that a dataset kind is told by."""
+    """Return the figures of merit that a dataset kind is told by.
+
+    >>> figure_names("rssi")
+    ('rmse_db', 'mae_db', 'nmse', 'mse')
+    """
     shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
     one = torch.ones(shape, dtype=torch.complex64 if kind.endswith("csi") else torch.float32)
     metric = metrics_for(kind)
@@ -251,9 +280,13 @@ def figure_names(kind: Scored) -> tuple[str, ...]:
 
 
 def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Per-sample values whose means are the flat figures, so that their differences can be paired.
+    """Return per-sample values whose means are the flat figures, so that their differences can be paired.
 
     `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
+
+    >>> error, power = np.array([1.0, 3.0]), np.array([10.0, 30.0])
+    >>> float(paired_values({"error_power": error, "target_power": power, "mse": error})["nmse"].mean())
+    0.1
     """
     direct = ("ssim", "ssim_gauss", "psnr_db", "snr_db", "mse")
     values: dict[str, np.ndarray] = {name: samples[name] for name in direct if name in samples}
@@ -283,6 +316,7 @@ def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, wind
 def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal or nothing is known."""
     with np.errstate(divide="ignore", invalid="ignore"):
+        # A difference of logarithms: the ratio of 1e-200 and 1e200 is no float64.
         ratio = 10 * (np.log10(signal) - np.log10(noise))
     return np.where(signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan)
 
