@@ -1,4 +1,10 @@
-"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map."""
+"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map.
+
+>>> import gsparc
+>>> predictor = gsparc.load("model.ckpt")  # or gsparc.fit(rx=..., tx=..., rssi=...)
+>>> predictor.rssi(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]]).shape  # two places [m], one transmitter
+(2, 1)
+"""
 
 import os
 from importlib import import_module

@@ -63,7 +63,11 @@ def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.nda
 
 
 def rival_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
-    """Minus the distance of places (B, 3) to the nearest that is known [m], or minus `process_variance`."""
+    """Return minus the distance of places (B, 3) to the nearest known one [m], or minus `process_variance`.
+
+    >>> rival_score("distance", np.zeros((1, 3)), None, np.array([[3.0, 4.0, 0.0]]))
+    array([-5.])
+    """
     if kind == "distance":
         return -cKDTree(known).query(places)[0]
     return -process_variance(kernel, known, places)
@@ -146,7 +150,11 @@ class Trusted:
 
 
 def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
-    """Scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order."""
+    """Return scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order.
+
+    >>> as_confidence("distance", np.array([0.0, -1.0, -9.0]))  # minus the distance [m]
+    array([1. , 0.5, 0.1])
+    """
     if kind == "learned":
         return score
     # An expected error, a variance in the prior's, or a distance in metres, of 1 is a confidence of a half.

@@ -33,7 +33,7 @@ def fit(
     seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None,
     align: str = "auto", **arrays: Any,
 ) -> Predictor:  # fmt: skip
-    """A model of all rows, ready to be asked; checks and messages are those of a file of one's own.
+    """Fit a model to all rows, ready to be asked; checks and messages are those of a file of one's own.
 
     >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
     >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]]).shape

@@ -97,6 +97,7 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
             f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this machine; the "
             f"fastest ({points[fastest].label}) takes {here[fastest]:.3g} ms{advice}"
         )
+    # The most accurate of those that fit; of equally accurate ones the fastest.
     best = max(fitting, key=lambda i: (points[i].score, -here[i]))
     torch.set_num_threads(points[best].threads)
     log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
@@ -106,10 +107,13 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
 def load(
     path: str | Path, budget_ms: float | None = None, confidence: str | None = None, unit: str | None = None
 ) -> Predictor:
-    """The model in a checkpoint, ready to be asked.
+    """Load the model in a checkpoint, ready to be asked.
 
     >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5]).shape
     (1,)
+
+    >>> gsparc.load("model.ckpt", unit="mW").unit
+    'mW'
 
     Args:
         path: the file.

@@ -65,7 +65,12 @@ def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
 
 
 def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
-    """Which places (n,) bool lie outside the box of the training places by more than a margin, and it [m]."""
+    """Tell which places (n,) bool lie farther outside the training places' box than a margin, and that [m].
+
+    >>> far, margin = far_outside({"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}, predictor.site)
+    >>> far, 0 < margin < 1  # a tenth of the longer side
+    (array([False,  True]), True)
+    """
     moving = [end for end in ("tx", "rx") if end in world]
     place = np.hstack([world[end] - site.origin for end in moving])  # type: ignore[index]
     low, high = site.moving_box

@@ -92,7 +92,7 @@ class Predictor:
         return "all" if free == "none" else f"up to {words(free)} of each row"
 
     def at(self, station: str | int) -> Predictor:
-        """The same model asked about one station alone, by name or number.
+        """Return the same model asked about one station alone, by name or number.
 
         >>> gsparc.load("city.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
         (1,)
@@ -114,7 +114,7 @@ class Predictor:
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, self._unit)
 
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
-        """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
+        """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
 
         >>> city = gsparc.load("city.ckpt")
         >>> city.at("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
@@ -143,7 +143,11 @@ class Predictor:
         return places[0] if single else places
 
     def degrees(self, position: Any) -> tuple[Any, Any, Any]:
-        """Latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+        """Return latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+
+        >>> latitude, longitude, height = gsparc.load("city.ckpt").degrees([0.0, 0.0, 1.5])
+        >>> height
+        1.5
 
         Raises:
             ValueError: measured in metres about an unknown origin, or no positions.
@@ -173,10 +177,14 @@ class Predictor:
     def predict(
         self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
     ) -> Prediction:
-        """Mean, variance and confidence (B, ...) at once, as tensors, in the unit of the measurements.
+        """Return mean, variance and confidence (B, ...) at once, as tensors, in the unit of the measurements.
 
         The confidence is None where the method has none; else the one that `confidence` answers. With `grad`
         it is the method's own, and None where `confidence` answers another.
+
+        >>> said = predictor.predict(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
+        >>> said.mean.shape, bool((said.variance > 0).all())  # dBm, and dBm^2 of a measurement
+        (torch.Size([2, 1]), True)
 
         Raises:
             ValueError: `grad` of a model without gradients, or of positions that are no tensors.
@@ -190,13 +198,20 @@ class Predictor:
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
-        """What `predict` says, powers as such: their levels are in `site.level_unit`."""
+        """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
+
+        >>> bool((predictor.linear(rx=[2.0, 1.0, 1.5]).mean > 0).all())  # no decibels
+        True
+        """
         return self.predict(tx, rx, unit=LINEAR if self.site.kind == "rssi" else None)
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
-        """Expected root mean square error of an entry, in the unit of the answers and float32.
+        """Return the expected root mean square error of an entry, in the unit of the answers and float32.
 
         Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1) of other kinds.
+
+        >>> predictor.std(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]]).shape  # [dB]
+        (2, 1)
 
         Raises:
             ValueError: the method knows none, or as in `rssi`.
@@ -252,7 +267,12 @@ class Predictor:
         return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
-        """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+        """Return power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+
+        >>> predictor.spectrum(rx=[2.0, 1.0, 1.5])  # of a model of powers
+        Traceback (most recent call last):
+            ...
+        ValueError: this model predicts rssi (dataset gsparc), not spectrum: call .rssi(...)
 
         Raises:
             ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
@@ -264,7 +284,7 @@ class Predictor:
         self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,
         symbols: int | None = None, grad: bool = False,
     ) -> Any:  # fmt: skip
-        """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
+        """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
         Args:
             tx, rx: positions; where the model reads a fresh uplink, none.
@@ -303,7 +323,7 @@ class Predictor:
         return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
-        """Received power (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
+        """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
 
         Of several stations, if neither end says which, of all (B, T), as they were measured: NaN of those
         that had too few training rows. A level is -inf where no power is predicted.
@@ -311,16 +331,25 @@ class Predictor:
         >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5], unit="mW").shape
         (1,)
 
+        >>> predictor.rssi(rx=torch.tensor([[2.0, 1.0, 1.5]])).dtype  # torch in, torch out
+        torch.float32
+        >>> gsparc.load("city.ckpt").rssi(rx=[[2.0, 1.0, 1.5]]).shape  # of both stations
+        (1, 2)
+
         Raises:
             ValueError: no unit that these powers can be turned into, or as in `spectrum`.
         """
         return self._of_stations(lambda one: one._ask("rssi", tx, rx, grad, unit), tx, rx)
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """How sure the model is, (B,) float32 in [0, 1], larger is surer.
+        """Return how sure the model is, (B,) float32 in [0, 1], larger is surer.
 
         Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
         `gsparc calibrate` found best, else the model's own.
+
+        >>> near, far = predictor.confidence(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]])
+        >>> bool(near > far)  # 900 m away from everything measured
+        True
 
         Raises:
             ValueError: the method has no confidence of that kind.
@@ -328,9 +357,14 @@ class Predictor:
         return _returned(*self._sure(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
+        """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
 
         None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+
+        >>> predictor.accepts(rx=[2.0, 1.0, 1.5])
+        Traceback (most recent call last):
+            ...
+        ValueError: accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not
 
         Raises:
             ValueError: the model was never calibrated, or for another kind of confidence.
@@ -410,6 +444,7 @@ class Predictor:
             moments = method.predict(replace(query, tx=local.get("tx", query.tx), rx=at))
         dtype = torch.float32
         for value in ends.values():
+            # Computed in float64, answered as precisely as the positions were given.
             dtype = torch.promote_types(dtype, value.dtype)
         said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)

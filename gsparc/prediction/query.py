@@ -91,7 +91,11 @@ class Queries:
 
 
 def usual_heights(site: Site) -> dict[End, float]:
-    """World height [m] of each end that moved and was always at the same height."""
+    """Return the world height [m] of each end that moved and was always at the same height.
+
+    >>> usual_heights(predictor.site)
+    {'rx': 1.5}
+    """
     moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
     low, high = site.moving_box[:, 2::3]
     # Rounded: the origin was taken away from it.
@@ -100,7 +104,15 @@ def usual_heights(site: Site) -> dict[End, float]:
 
 
 def read_places(end: str, value: Any) -> np.ndarray:
-    """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
+    """Read (3,) or (B, 3) [m] as float64 until the origin is subtracted, or far sites lose millimetres.
+
+    >>> read_places("rx", [[0.0, 1.0, 2.0]]).shape
+    (1, 3)
+    >>> read_places("rx", [0.0, 1.0])
+    Traceback (most recent call last):
+        ...
+    ValueError: rx= must be (3,) or (B, 3) [m], got shape (2,)
+    """
     try:
         array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)
         array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")

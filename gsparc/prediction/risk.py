@@ -62,6 +62,11 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
 class Guarantee:
     """What is promised.
 
+    >>> Guarantee(alpha=0.1, delta=0.1).least  # 0.9^22 is below 0.1
+    22
+    >>> Guarantee(limit_db=-10.0).bad(np.array([0.05, 0.5]))
+    array([False,  True])
+
     Attributes:
         limit_db: a prediction is bad when |e|^2 / |h|^2 exceeds this [dB].
         alpha: largest share of bad ones among the accepted.
@@ -79,6 +84,7 @@ class Guarantee:
     @property
     def least(self) -> int:
         """Positions that must be accepted, all of them good, before anything can be promised."""
+        # n good ones by chance, though a share alpha is bad, have probability (1 - alpha)^n.
         return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
 
     def bad(self, relative_error: np.ndarray) -> np.ndarray:
@@ -89,6 +95,9 @@ class Guarantee:
 @dataclass(frozen=True)
 class Threshold:
     """A threshold and what it was chosen on.
+
+    >>> round(Threshold(value=0.7, accepted=22, bad=0).bound(delta=0.1), 3)
+    0.099
 
     Attributes:
         value: accept scores of at least this; infinite when nothing can be promised.
@@ -102,11 +111,16 @@ class Threshold:
 
     def bound(self, delta: float) -> float:
         """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
+        # Two tails of delta each: the upper end alone is exceeded with that probability.
         return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
 
 
 def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:
-    """Clopper and Pearson's interval (1934) of a rate."""
+    """Return Clopper and Pearson's interval (1934) of a rate.
+
+    >>> [round(end, 3) for end in binomial_interval(5, 50)]
+    [0.033, 0.218]
+    """
     if count == 0:
         return 0.0, 1.0
     tail = (1 - level) / 2
@@ -127,12 +141,16 @@ def choose(
     promise: Guarantee,
     group: np.ndarray | None = None,
 ) -> Threshold:
-    """The laxest threshold that the calibration set (n,) supports.
+    """Choose the laxest threshold that the calibration set (n,) supports.
 
     Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
     by the design effect, how much more the share varies between patches than binomial counts would (Kish
     1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
     could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
+
+    >>> score = np.linspace(0, 1, 100)
+    >>> choose(score, score < 0.5, levels_of(score), Guarantee()).accepted >= 50  # all bad ones are unsure
+    True
     """
     threshold = Threshold(float("inf"), 0, 0)
     for level in levels:
@@ -141,6 +159,7 @@ def choose(
         if accepted < promise.least:
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
+        # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
         if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
             break
         threshold = Threshold(float(level), accepted, wrong)
@@ -152,6 +171,9 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
 
     A variance between few groups is itself uncertain: what is returned is its one-sided bound at
     `SURE_OF_EFFECT`, as of a normal variance.
+
+    >>> design_effect(np.array([1, 1, 0, 0]), np.array([0, 0, 1, 1])) > 1  # neighbours err together
+    True
     """
     _, which = np.unique(group, return_inverse=True)
     counts, wrong = np.bincount(which), np.bincount(which, bad)
@@ -159,12 +181,14 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     if groups < 2 or share in (0.0, 1.0):
         return 1.0
     between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
+    # A sample variance of a normal variable, over the true one, is chi squared over its degrees of freedom.
     bound = (groups - 1) / chi2.ppf(1 - SURE_OF_EFFECT, groups - 1)
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
 def _tail(wrong: float, accepted: float, alpha: float) -> float:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
+    # The binomial tail as a regularised incomplete beta function, which takes counts that are not whole.
     return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
 
 
@@ -174,10 +198,13 @@ def bounded(relative_error: np.ndarray) -> np.ndarray:
 
 
 def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
-    """Mean loss of the 1, 2, ..., n surest of n predictions, (n,).
+    """Return the mean loss of the 1, 2, ..., n surest of n predictions, (n,).
 
     Its mean is the area under risk against coverage (Geifman, Uziel and El-Yaniv 2019). Equal scores share
     their mean loss: their order cannot matter.
+
+    >>> risk_coverage(np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5]))
+    array([0.  , 0.25, 0.5 ])
 
     Args:
         score: (n,), larger is surer.
@@ -190,7 +217,11 @@ def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
 
 
 def rank_correlation(score: np.ndarray, loss: np.ndarray) -> float | None:
-    """Spearman's correlation of being sure (n,) and being right, minus the loss (n,); None of a constant."""
+    """Return Spearman's correlation of scores (n,) with minus the losses (n,); None where one is constant.
+
+    >>> round(rank_correlation(np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])), 3)
+    1.0
+    """
     if np.ptp(score) == 0 or np.ptp(loss) == 0:
         return None
     return float(spearmanr(score, -loss).statistic)
