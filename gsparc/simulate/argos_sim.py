@@ -66,7 +66,11 @@ def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
 
 
 def array() -> np.ndarray:
-    """Element positions (64, 3) [m] about the base: an upright half-wavelength square, row by row."""
+    """Return element positions (64, 3) [m] about the base: an upright half-wavelength square, row by row.
+
+    >>> array().shape
+    (64, 3)
+    """
     step = LIGHT / CARRIER_HZ / 2 * (np.arange(SIDE) - (SIDE - 1) / 2)
     across = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)  # it faces both streets of the crossing
     z, x = np.meshgrid(step, step, indexing="ij")
@@ -131,6 +135,7 @@ def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
         signal = clean[some] * np.exp(1j * turn)[:, None]
         # A frequency offset turns the samples of a symbol, which leaks tones into one another.
         grid = np.zeros((*signal.shape[:2], FFT), complex)
+        # Tones below the carrier stand in the upper half of the transform.
         grid[..., TONES % FFT] = signal * pilot
         turning = np.exp(2j * np.pi * np.outer(drift[some], np.arange(FFT)) / FFT)
         samples = np.fft.ifft(grid) * turning[:, None]

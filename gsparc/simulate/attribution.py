@@ -27,6 +27,9 @@ DEFAULTS = {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}  # where the text giv
 class Deliverable:
     """A requirement: kind of error, tolerance and share of receivers.
 
+    >>> str(Deliverable.parse("csi -20 dB"))
+    'channel NMSE at most -20 dB for 95% of the receivers'
+
     Attributes:
         kind: `coverage` (received power), `csi` (channel) or `spectrum`.
         tolerance: largest error: |dB| of received power; NMSE of the channel in dB; for spectra the error as
@@ -173,7 +176,12 @@ class Probe:
 
 
 def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
-    """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
+    """Return what can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation.
+
+    >>> full = PropagationEffects(depth=2).without("refraction", "diffraction", "diffuse")
+    >>> list(removals(full))
+    ['line_of_sight', 'specular', 'depth > 1', 'polarisation']
+    """
     names = [*full.on, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
     names += ["polarisation"] if full.polarisation else []
     return {name: less for name in names if (less := _without(full, name)) is not None}
@@ -236,6 +244,7 @@ def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[f
     """Loss [dB] of a reflection off, and of a passage through, a lossless slab at normal incidence."""
     index = np.sqrt(float(material["permittivity"]))
     fresnel = (1 - index) / (1 + index)
+    # Airy's sum over all passes through the slab; what does not pass a lossless one comes back.
     turn = np.exp(-4j * np.pi * index * float(material["thickness_m"]) / wavelength)
     through = (1 - fresnel**2) * np.sqrt(turn) / (1 - fresnel**2 * turn)
     back = 1 - abs(through) ** 2

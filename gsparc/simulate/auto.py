@@ -253,22 +253,33 @@ def without_fewer_rays(choice: Choice) -> Choice:
 
 
 def first_look(receivers: int) -> int:
-    """How many of so many receivers are looked at first."""
+    """Return how many of so many receivers are looked at first.
+
+    >>> first_look(129)
+    65
+    """
     return math.ceil(FIRST_LOOK * receivers)
 
 
 def allowed_failures(first: int, all_: int, quantile: float, confidence: float) -> tuple[int, int]:
-    """Most receivers beyond the tolerance, at the first look and among all, for the requirement to follow.
+    """Return how many receivers may exceed the tolerance, at the first look and among all, for a proof.
 
     A test in two stages: were the requirement violated, it would pass one of them with a probability of at
     most 1 - confidence, a third of which the first look spends (exact binomial probabilities; the first look
     has -1 where it proves nothing). 0 at the last look where even none proves nothing.
+
+    >>> allowed_failures(10, 20, quantile=0.95, confidence=0.85)  # too few to prove anything
+    (-1, 0)
+    >>> [int(most) for most in allowed_failures(64, 128, quantile=0.95, confidence=0.85)]
+    [0, 3]
     """
     wrong, risk = 1 - quantile, 1 - confidence
     early = int(binom.ppf(risk * SPENT, first, wrong))
+    # `ppf` is the least count that reaches the risk: one less stays below it.
     early -= binom.cdf(early, first, wrong) > risk * SPENT
 
     def passes(late: int) -> float:
+        # Passed at the first look, or failed there and passed at the last.
         between = np.arange(early + 1, late + 1)
         rest = binom.pmf(between, first, wrong) * binom.cdf(late - between, all_ - first, wrong)
         return float(binom.cdf(early, first, wrong) + rest.sum())
@@ -280,7 +291,12 @@ def allowed_failures(first: int, all_: int, quantile: float, confidence: float) 
 
 
 def price(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
-    """Expected time of tracing with some effects and a share of the rays, 1 with everything."""
+    """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
+
+    >>> full = PropagationEffects(depth=5)
+    >>> price(full, full), price(full.without("diffuse"), full) < 1
+    (1.0, True)
+    """
     off = [name for name in full.on if name not in effects.on]
     off += ["polarisation"] if full.polarisation and not effects.polarisation else []
     bounces = 1 - BOUNCES + BOUNCES * effects.depth / max(full.depth, 1)

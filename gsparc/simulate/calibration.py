@@ -34,6 +34,10 @@ ROUNDS = 100  # of expectation maximisation
 class Material:
     """Of a surface.
 
+    >>> again = Material.of(Material(5.0, 0.05).logarithms())
+    >>> round(again.permittivity, 6), round(again.conductivity, 6)
+    (5.0, 0.05)
+
     Attributes:
         permittivity: relative, above 1.
         conductivity: [S/m].
@@ -44,6 +48,7 @@ class Material:
 
     def logarithms(self) -> np.ndarray:
         """(2,) what is optimised."""
+        # A conductor's permittivity is 1, an insulator's conductivity 0: neither has a logarithm.
         return np.log([max(self.permittivity - 1, 1e-3), max(self.conductivity, 1e-6)])
 
     @staticmethod
@@ -248,14 +253,19 @@ def calibrate(
 
 
 def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
-    """Location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
+    """Return location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
 
     Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at least
     `LEAST_DB`.
+
+    >>> missed = np.array([2.0, 3.0, 3.0, 3.0, 4.0, 60.0])  # [dB], the last by a shadow
+    >>> bool(gain_and_scale(missed)[0] < missed.mean() / 3)
+    True
     """
     gain = float(np.median(missed))
     scale = max(float(np.median(np.abs(missed - gain))), LEAST_DB)
     for _ in range(ROUNDS):
+        # The expectation: receivers far off their level weigh little.
         weight = (TAILS + 1) / (TAILS + ((missed - gain) / scale) ** 2)
         gain = float(weight @ missed / weight.sum())
         scale = max(math.sqrt(float(weight @ (missed - gain) ** 2) / len(missed)), LEAST_DB)
@@ -263,7 +273,12 @@ def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
 
 
 def student(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
-    """Negative log likelihood of residuals (n,) but for a constant, and its slopes (n,)."""
+    """Return the negative log likelihood of residuals (n,) but for a constant, and its slopes (n,).
+
+    >>> value, slopes = student(np.zeros(2), scale=1.0)
+    >>> value, slopes.tolist()
+    (0.0, [0.0, 0.0])
+    """
     z = residual / scale
     value = float((TAILS + 1) / 2 * np.log1p(z**2 / TAILS).sum() + len(z) * math.log(scale))
     return value, (TAILS + 1) * z / (TAILS + z**2) / scale

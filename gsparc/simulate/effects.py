@@ -67,13 +67,21 @@ class PropagationEffects:
         return tuple(name for name in MECHANISMS if getattr(self, name))
 
     def without(self, *names: str) -> PropagationEffects:
-        """The same with some switched off, and with what needs them."""
+        """Return the same with some switched off, and with what needs them.
+
+        >>> PropagationEffects().without("diffraction").on  # edges need it
+        ('line_of_sight', 'specular', 'refraction', 'diffuse')
+        """
         needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
         off = {*names, *(needs[name] for name in names if name in needs)}
         return replace(self, **dict.fromkeys(off, False))
 
     def allows(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
-        """Which paths exist under these switches: (P,) bool.
+        """Tell which paths exist under these switches: (P,) bool.
+
+        >>> effects = PropagationEffects(refraction=False, depth=2)
+        >>> effects.allows(np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8), np.array([0, 1, 1, 3]))
+        array([ True,  True, False, False])
 
         Args:
             mechanisms: (P,) OR of the bits of all interactions of a path.

@@ -14,6 +14,11 @@ from gsparc.simulate.effects import PropagationEffects
 class Paths:
     """Paths of R receivers, sorted by receiver and then by delay; those of r are `offsets[r]:offsets[r+1]`.
 
+    >>> owner, delay, count = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8]), np.zeros(3, np.uint8)
+    >>> paths = Paths.of(2, owner, np.ones((3, 1), np.complex64), delay, np.ones((3, 3)), count, count)
+    >>> paths.offsets, paths.received_power()  # one path of the first receiver, two of the second
+    (array([0, 1, 3]), array([1., 2.]))
+
     Attributes:
         offsets: (R + 1,) int64.
         gain: (P, ports) complex64 without the carrier's phase, one column per received polarisation.
@@ -36,6 +41,7 @@ class Paths:
         mechanisms: np.ndarray, order: np.ndarray,
     ) -> Paths:  # fmt: skip
         """Of paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
+        # The last key counts most: by receiver, then by delay.
         rank = np.lexsort((delay, owner))
         offsets = starts(np.bincount(owner, minlength=receivers))
         return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
@@ -109,7 +115,11 @@ ARRAYS = ("gain", "delay", "direction", "mechanisms", "order")
 
 
 def starts(counts: np.ndarray) -> np.ndarray:
-    """Offsets (R + 1,) of consecutive groups of `counts` (R,) paths."""
+    """Return offsets (R + 1,) of consecutive groups of `counts` (R,) paths.
+
+    >>> starts(np.array([2, 0, 1]))
+    array([0, 2, 2, 3])
+    """
     return np.concatenate([[0], np.cumsum(counts)])
 
 

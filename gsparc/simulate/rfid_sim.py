@@ -43,7 +43,11 @@ ROOM = Room(
 
 
 def hand_moved(count: int, seed: int) -> np.ndarray:
-    """Tag positions (count, 3) [m] along smooth curves in the release's box, about 1.1 cm apart."""
+    """Draw tag positions (count, 3) [m] along smooth curves in the release's box, about 1.1 cm apart.
+
+    >>> hand_moved(100, seed=0).shape
+    (100, 3)
+    """
     rng = np.random.default_rng(seed)
     center, half = HAND_BOX.mean(axis=0), np.ptp(HAND_BOX, axis=0) / 2
     pieces = []

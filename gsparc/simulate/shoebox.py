@@ -52,7 +52,11 @@ class Room:
         return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool."""
+        """Tell whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool.
+
+        >>> Room.uniform((6.0, 4.0, 3.0)).contains(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]))
+        array([ True, False])
+        """
         inside = np.all((points > self.lower) & (points < self.upper), axis=-1)
         for low, high in self.occluders:
             inside = inside & ~np.all((points >= low) & (points <= high), axis=-1)
@@ -86,7 +90,11 @@ class Images:
 
 
 def images(room: Room, max_order: int) -> Images:
-    """All images of order <= `max_order`, sorted by order; the first is the point itself."""
+    """Return all images of order <= `max_order`, sorted by order; the first is the point itself.
+
+    >>> images(Room.uniform((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # the point, and one in each wall
+    [0, 1, 1, 1, 1, 1, 1]
+    """
     reach = range(-max_order, max_order + 1)
     cells = [c for c in product(reach, repeat=3) if sum(map(abs, c)) <= max_order]
     cell = np.array(sorted(cells, key=lambda c: (sum(map(abs, c)), c)), dtype=np.int64)
@@ -103,11 +111,12 @@ def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The map p -> signs * p + offsets into cells (I, 3)."""
     size = np.asarray(room.upper) - room.lower
     even = cell % 2 == 0
+    # An even cell is a shifted copy of the room; an odd one is mirrored, the cell -1 in the lower wall.
     return np.where(even, 1.0, -1.0), np.where(even, 0.0, 2.0 * room.lower + size) + cell * size
 
 
 def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
-    """Whether each observer sees each image of a source, exactly: (S, I) bool.
+    """Tell whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
     blocked when it meets a copy of an occluder in one of them (unfolding). Source and observer are (S, 3) [m]
@@ -137,6 +146,7 @@ def _meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray
     near, far = np.minimum(near, far), np.maximum(near, far)
     outside = parallel & ((start < low) | (start > high))
     near, far = np.where(parallel, -np.inf, near), np.where(parallel, np.inf, far)
+    # A segment meets the box where it is between all three pairs of planes at once.
     return (np.maximum(near.max(axis=1), 0.0) <= np.minimum(far.min(axis=1), 1.0)) & ~outside.any(axis=1)
 
 
@@ -175,7 +185,11 @@ def trace(
     snr_db: float | None = None,
     seed: int = 0,
 ) -> Trace:
-    """Channels between every pair of rows: `sum_i v_i g_i exp(-j 2 pi f d_i / c) wavelength / (4 pi d_i)`.
+    """Compute channels of all rows: `sum_i v_i g_i exp(-j 2 pi f d_i / c) wavelength / (4 pi d_i)`.
+
+    >>> room, tones = Room.uniform((6.0, 4.0, 3.0)), np.array([2.40e9, 2.41e9])
+    >>> trace(room, np.array([1.0, 1.0, 1.0]), np.array([[5.0, 3.0, 1.0], [2.0, 1.0, 1.0]]), tones).csi.shape
+    (2, 1, 2)
 
     Args:
         tx, rx: (S, 3) or (3,) [m] inside the room, broadcast against each other.
@@ -211,6 +225,7 @@ def trace(
     if snr_db is not None:
         variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (snr_db / 10))
         rng = np.random.default_rng(seed)
+        # Half of the variance in the real part, half in the imaginary one.
         csi += np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
 

@@ -34,7 +34,11 @@ class ArraySettings:
     spacing: float = 0.5
 
     def elements(self, wavelength: float) -> np.ndarray:
-        """Positions (M, 3) [m] of the elements about their middle."""
+        """Return positions (M, 3) [m] of the elements about their middle.
+
+        >>> ArraySettings(rows=2, columns=1).elements(wavelength=0.1)[:, 0].tolist()
+        [-0.025, 0.025]
+        """
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
         return np.stack(np.meshgrid(x, y, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -77,7 +81,11 @@ class SpectrumSettings(ArraySettings):
         return SphereGrid.hemisphere(self.height, self.width)
 
     def near_field(self, wavelength: float) -> float:
-        """Fraunhofer distance of the array, 2 D^2 / wavelength [m]; nearer, waves over it are not plane."""
+        """Return the array's Fraunhofer distance, 2 D^2 / wavelength [m]; nearer, waves on it are not plane.
+
+        >>> round(SpectrumSettings(rows=8, columns=8).near_field(wavelength=0.1), 3)
+        4.9
+        """
         size = float(np.linalg.norm(np.ptp(self.elements(wavelength), axis=0)))
         return 2 * size**2 / wavelength
 
@@ -142,6 +150,7 @@ class _Bartlett:
     def __call__(self, channels: np.ndarray) -> np.ndarray:
         """Power (R, H, W) of channels (R, ports, M, K)."""
         lattice = np.moveaxis(channels, 2, -1).reshape(*channels.shape[:2], channels.shape[3], *self.shape)
+        # Padded to twice the size, so that the circular autocorrelation is the one of the lattice.
         power = np.abs(np.fft.fft2(lattice, s=self.padded)) ** 2
         lags = np.fft.ifft2(power.mean(axis=2).sum(axis=1)).reshape(len(channels), -1)[:, self.half]
         lags = lags / np.prod(self.shape) ** 2
@@ -154,6 +163,7 @@ class _Bartlett:
 def _beams(paths: Paths, settings: SpectrumSettings) -> np.ndarray:
     """Power (R, H, W): von Mises-Fisher spots of half power at half the stated width."""
     directions = settings.grid.directions(torch.float32).reshape(-1, 3)
+    # exp(sharpness (cos - 1)) is a half at half of the beam's width.
     sharpness = np.log(2) / (1 - np.cos(np.radians(settings.beam_deg) / 2))
     images = np.zeros((len(paths), settings.height * settings.width), dtype=np.float32)
     for r, (start, stop) in enumerate(zip(paths.offsets[:-1], paths.offsets[1:], strict=True)):

@@ -25,6 +25,11 @@ LEAST_BEND = 0.1  # [rad]; Keller's coefficient has a pole on the shadow boundar
 class Streets:
     """A few city blocks and what stands between them.
 
+    >>> block, none = np.array([[[10.0, -5.0], [20.0, 5.0]]]), np.zeros(0)
+    >>> streets = Streets(block, np.array([-0.8]), np.zeros((0, 3)), none, none, base=np.zeros(3))
+    >>> streets.blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind the block, beside it
+    array([ True, False])
+
     Attributes:
         buildings: (n, 2, 2) [m] lower and upper corners in the plane.
         reflection: (n,) real amplitude reflection coefficient of each building's walls.
@@ -107,6 +112,7 @@ def trace(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
             climb = sign * users[route.users, 2] - streets.base[2]
             length = np.hypot(route.length, climb)
             at = route.users, np.full(len(route.users), 2 * i + j)
+            # Gains of routes are of lengths in the plane; amplitudes fall with the lengths in space.
             gain[at] = route.gain * loss * route.length / length
             delay[at] = length / LIGHT
             flat = route.towards * (route.length / length)[:, None]
@@ -188,6 +194,7 @@ def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Itera
     users = np.flatnonzero(~streets.blocked(np.broadcast_to(place, flat.shape), flat))
     if len(users):
         near, far = np.linalg.norm(place - base), np.linalg.norm(flat[users] - place, axis=1)
+        # The far field of a scatterer: at the scatterer itself a user would hear infinite power.
         far = np.maximum(far, 1.0)
         unit = np.broadcast_to((place - base) / near, (len(users), 2))
         yield _Route(users, near + far, unit, law(near, far) + 0j)
@@ -204,6 +211,7 @@ def _edge(
             continue
         onward = flat[users] - corner
         onward /= np.maximum(np.linalg.norm(onward, axis=1, keepdims=True), 1e-9)
+        # The angle by which a ray is bent into the shadow.
         bend = np.arccos(np.clip((onward * route.towards[hidden]).sum(1), -1, 1))
         keller = 1 / (2 * np.sqrt(2 * np.pi * number)) / np.sin(np.maximum(bend, LEAST_BEND) / 2)
         gain = spread * keller * route.gain[hidden] * np.exp(-0.25j * np.pi)
