@@ -16,6 +16,9 @@ from gsparc.training.schedule import INTERVAL, in_steps
 class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after all other callbacks
     """Write the state every `interval` steps, or share of all steps; after the last step it always is.
 
+    >>> Checkpoint(interval=500).interval  # steps; 0.25 is a quarter of them
+    500
+
     Args:
         interval: steps between two; below 1 a share of all steps.
     """

@@ -28,6 +28,13 @@ MOST_CHANGE = 1e-3  # root mean square, that an edit may make of spectra whose e
 class Densify(Checked, L.Callback):
     """Clone, split and prune on a schedule of steps.
 
+    >>> Densify(start=0.1, stop=0.6, interval=50, max_gaussians=2_000).children
+    2
+    >>> Densify(children=1)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: children=1: a whole number of at least 2 is needed
+
     Args:
         start, stop, interval: first step, last step and spacing of the edits; below 1 a share of all steps.
         grad_threshold: mean screen-space gradient norm [loss per px] above which a Gaussian is
@@ -122,6 +129,7 @@ class Densify(Checked, L.Callback):
                 that the field renders as before: for emissions that were solved for it.
         """
         gaussians = model.gaussians
+        # Over the rows that saw it: a sum would grow with how often a Gaussian is in view.
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
         under_reconstructed = mean_gradient >= self.grad_threshold
         size = gaussians.scales.amax(1)
@@ -134,6 +142,7 @@ class Densify(Checked, L.Callback):
         prune = self._keep_at_least(prune, gaussians.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
+        # A split removes its parent, a clone leaves it there.
         cost = torch.where(large | in_place, self.children - 1, 1)
         chosen = self._strongest(under_reconstructed & ~prune, mean_gradient, cost, room)
         clone, split = (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
@@ -141,8 +150,10 @@ class Densify(Checked, L.Callback):
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
         parents = torch.cat([clones, splits])
         if in_place:
+            # N layers of opacity b let through (1 - b)^N, which is to be 1 - a of the parent.
             apart = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
             return edit.Edit(~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart)})
+        # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al., 3D Gaussian splatting (2023).
         smaller = gaussians.log_scales[splits] - math.log(0.8 * self.children)
         scales = torch.cat([gaussians.log_scales[clones], smaller])
         spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)
@@ -153,6 +164,7 @@ class Densify(Checked, L.Callback):
     def _keep_at_least(self, prune: Tensor, opacities: Tensor) -> Tensor:
         short = min(self.min_gaussians, len(prune)) - int((~prune).sum())
         if short > 0:
+            # Of those that were to go, the most opaque stay.
             candidates = torch.where(prune, opacities, -torch.ones_like(opacities))
             prune = prune.clone()
             prune[candidates.topk(short).indices] = False
@@ -161,6 +173,7 @@ class Densify(Checked, L.Callback):
     @staticmethod
     def _strongest(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
         rank = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient))
+        # Stable: where gradients are equal, a resumed run chooses the same.
         order = rank.argsort(descending=True, stable=True)
         spent = torch.where(under_reconstructed, cost, 0)[order].cumsum(0)
         chosen = torch.zeros_like(under_reconstructed)

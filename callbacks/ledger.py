@@ -16,6 +16,11 @@ class CostLedger(L.Callback):
     """A stopwatch that runs only while the model learns, and the learning curve against it.
 
     `learning_curve.csv` in the run directory has a row per validation, the first before the first step.
+
+    >>> ledger = CostLedger()
+    >>> with ledger.paused():  # for work that is not training
+    ...     ledger.elapsed()
+    0.0
     """
 
     def __init__(self) -> None:
@@ -54,7 +59,7 @@ class CostLedger(L.Callback):
         self._running_since = None
 
     def elapsed(self) -> float:
-        """Training time so far [s]."""
+        """Return the training time so far [s]."""
         running = 0.0 if self._running_since is None else time.perf_counter() - self._running_since
         return self.seconds + running
 

@@ -20,6 +20,11 @@ from gsparc.training.tracking import picture
 class Pictures(Checked, L.Callback):
     """Draw a few validation rows; without any, nothing, because training rows flatter.
 
+    >>> Pictures(count=0)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: count=0: a whole number of at least 1 is needed
+
     Args:
         every: steps between pictures, or a share of all; the last step is always drawn.
         count: number of rows drawn.
@@ -39,6 +44,7 @@ class Pictures(Checked, L.Callback):
         candidates = data.fold.val
         if not len(candidates):
             return
+        # The same rows at every step, so that pictures can be compared.
         rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
         with CostLedger.paused_in(trainer), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)

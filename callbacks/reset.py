@@ -25,6 +25,11 @@ class OpacityReset(Checked, L.Callback):
     there is no reset, nor in a training of fewer than `least_steps`, nor after a start in closed form, whose
     emissions were solved for the opacities as they are.
 
+    >>> OpacityReset(ceiling=1.5)
+    Traceback (most recent call last):
+        ...
+    gsparc.data.limits.SettingError: ceiling=1.5: a number above 0 and below 1 is needed
+
     Args:
         interval: steps between resets; below 1 a share of all steps.
         stop: last step at which one may happen, or its share.
@@ -62,9 +67,11 @@ class OpacityReset(Checked, L.Callback):
             lowered = field.opacity_logits > ceiling
             field.opacity_logits.clamp_(max=ceiling)
             state = trainer.optimizers[0].state.get(field.opacity_logits, {})
+            # Adam's moments are of the opacities before: kept, they would carry the old step on.
             for key in ("exp_avg", "exp_avg_sq"):
                 if key in state:
                     state[key][lowered] = 0
+            # Views frozen before are refused from now on.
             field.version += 1
         count = int(lowered.sum())
         log.info("step %d: opacities of %d Gaussians lowered to %g", step, count, self.ceiling)
