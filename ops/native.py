@@ -44,6 +44,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, pose = gaussians.means, plan.pose
     call = partial(calls.run, sizes=(plan.num_poses, len(means)), settings=plan.settings)
     inputs = contiguous((*gaussians, pose.position, pose.rotation, ids))
+    # In two passes: how many entries there are is known when all footprints have been placed.
     status = call("plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible)
     validation.raise_for_status(status, pose)
     entries = int(plan.buffers.starts.numpy()[-1])  # torch's own element takes ten times as long
@@ -122,6 +123,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     counts = torch.zeros(
         strips(grid.height) * grid.width + 1, dtype=torch.int64
     )  # a tile has a column at least
+    # Counted first, filled afterwards: the rows of a sparse matrix have no size before.
     lanes = run(counts, None, None)
     starts = counts[: strips(grid.height) * -(-grid.width * rows // lanes) + 1].cumsum(0)
     size = int(starts[-1])

@@ -91,6 +91,7 @@ class _Operator(torch.autograd.Function):
     def forward(ctx, operator, gradient, reads_outputs, fixed, *tensors):
         outputs = operator(fixed, *tensors)
         ctx.gradient, ctx.fixed = gradient, fixed
+        # An output that nothing depends on has the slope None instead of an image of zeros.
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*(outputs if reads_outputs else ()), *tensors)
         return outputs
@@ -122,6 +123,7 @@ def differentiable(
 
 def strips(height: int) -> int:
     """Strips of an image so many rows high."""
+    # Rounded up: the last strip may be cut off.
     return -(-height // calls.kernels().STRIP_ROWS)
 
 

@@ -66,6 +66,7 @@ def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     no_shift = torch.zeros_like(plan.means2d)
     for index in range(plan.num_poses):
         weights, alpha, _ = _weights(plan, index, gaussians, no_shift)
+        # From the order of depth back to the order of the Gaussians.
         inverse = torch.argsort(plan.buffers[0][index])
         seen.append(weights.sum(1)[inverse])
         total.append(alpha.sum(1)[inverse])
@@ -111,6 +112,7 @@ def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> t
     order = plan.buffers[0][index]
     near = Gaussians._make(None if t is None else t[order] for t in gaussians)
     seen = reference.project(near.means, near.quats, near.scales, plan.pose[index], plan.grid, plan.optics)
+    # Zero in value, with the slope of the centres on the screen.
     shift = (means2d[index] - means2d[index].detach())[order]
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
     hides = near.opacities if near.extinctions is None else near.extinctions

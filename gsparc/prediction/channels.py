@@ -21,15 +21,24 @@ SUBCARRIERS_PER_BLOCK = 12
 
 
 def centred(middle_hz: float, spacing_hz: float, count: int) -> np.ndarray:
-    """Frequencies (count,) [Hz] of a grid about `middle_hz`."""
+    """Return frequencies (count,) [Hz] of a grid about `middle_hz`.
+
+    >>> centred(100.0, 10.0, 4).tolist()
+    [85.0, 95.0, 105.0, 115.0]
+    """
     return middle_hz + (np.arange(count) - (count - 1) / 2) * spacing_hz
 
 
 def interpolated(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -> Tensor:
-    """Channels (..., K) at tones (K,) [Hz] as (..., W) at other frequencies of the same band.
+    """Return channels (..., K) at tones (K,) [Hz] as (..., W) at other frequencies of the same band.
 
     The best linear interpolation of channels whose delays fill `WINDOW_S` evenly about their mean; a single
     tone is repeated.
+
+    >>> tones = centred(2.4e9, 1e6, 16)
+    >>> between = interpolated(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
+    >>> between.shape, bool((between[0, 5:10] - 1).abs().max() < 0.05)  # of a channel without delay
+    (torch.Size([1, 15]), True)
 
     Raises:
         ValueError: a wanted frequency lies more than a tone outside the band.
@@ -42,12 +51,15 @@ def interpolated(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -
             f"the grid spans {wanted_hz.min() / 1e6:.3f} to {wanted_hz.max() / 1e6:.3f} MHz, the tones "
             f"{tones_hz.min() / 1e6:.3f} to {tones_hz.max() / 1e6:.3f} MHz: take fewer blocks"
         )
+    # Tones a step apart tell delays within 1 / step alone from each other.
     window = min(WINDOW_S, 0.8 / step)
+    # The mean delay is taken off and put back: the window lies about it.
     turn = _mean_turn(channel) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
     middle = float(tones_hz.mean())
     straight = channel * torch.polar(
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
     )
+    # Delays spread evenly over a window correlate over frequency as a sinc: this is the Wiener filter.
     known = np.sinc(window * (tones_hz[:, None] - tones_hz)) + REGULARISED * np.eye(len(tones_hz))
     cross = np.sinc(window * (wanted_hz[:, None] - tones_hz))
     matrix = torch.from_numpy(np.linalg.solve(known, cross.T)).to(channel.dtype)
@@ -63,10 +75,13 @@ def _mean_turn(channel: Tensor) -> Tensor:
 
 
 def resource_grid(channel: Tensor, symbols: int, moving_end: str) -> Tensor:
-    """Channels (B, A, K) as Sionna's [rx, rx_ant, tx, tx_ant, symbols, K]; nothing moves within a slot.
+    """Return channels (B, A, K) as Sionna's [rx, rx_ant, tx, tx_ant, symbols, K], constant within a slot.
 
     B receivers hear one transmitter of A antennas where the receiver moves; else one receiver of A antennas
     hears B transmitters.
+
+    >>> resource_grid(torch.ones(5, 4, 12, dtype=torch.complex64), symbols=14, moving_end="rx").shape
+    torch.Size([5, 1, 1, 4, 14, 12])
     """
     slots = channel.unsqueeze(-2).expand(*channel.shape[:2], symbols, channel.shape[2])
     if moving_end == "rx":

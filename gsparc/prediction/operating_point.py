@@ -83,6 +83,7 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
     if not points:
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
+    # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [reduced(method, point.settings, measured) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
