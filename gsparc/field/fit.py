@@ -23,10 +23,10 @@ from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.module import NetworkModule
+from gsparc.field.pace import SPENT, Budget
+from gsparc.field.processes import Processes
 from gsparc.training.context import FitContext
-from gsparc.training.module import NetworkModule
-from gsparc.training.pace import SPENT, Budget
-from gsparc.training.processes import Processes
 from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
