@@ -217,6 +217,7 @@ def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(v
     np.testing.assert_allclose(session.plane.level_db, level - law.at(far), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_drags_leave_nothing_behind(visit, spectrum_view):
     session = visit(spectrum_view)
     settle(session)
