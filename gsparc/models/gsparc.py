@@ -120,7 +120,7 @@ class Gsparc(LearnsTogether):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        solved = "solution" in state  # a field in closed form says itself what it is
+        solved = "members" in state  # a field in closed form says itself what it is
         self.site, self.chosen = site, Channels() if solved else self.rendered
         self.chosen.name = self.name
         self.chosen.restore(site, state)
@@ -139,7 +139,8 @@ class Gsparc(LearnsTogether):
     threads_pay = _its("threads_pay")
     gradient_problem = _its("gradient_problem")
     field_alone = _its("field_alone")
-    solution = _its("solution")
+    only = _its("only")
+    parts = _its("parts")
     fitted = _its("fitted")
     steps = _its("steps")
     steps_taken = _its("steps_taken")

@@ -37,7 +37,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         field=FieldSettings(count=count), **more,
     )  # fmt: skip
     found = choose(data, settings)
-    parts = found.parts(data) if isinstance(found, NamedMixture) else ()
+    parts = found.tries(data) if isinstance(found, NamedMixture) else ()
     return parts, not parts and found.settings.response.array
 
 
