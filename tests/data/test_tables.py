@@ -2,6 +2,7 @@
 # ruff: noqa: E501 (a case is a row of a table)
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
