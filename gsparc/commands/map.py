@@ -80,5 +80,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         reach = promise.calibration(how.share).reach
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
-    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
+    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s)"
+    if field.calibrated:
+        before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
+    before += "; map "
     return finish(run_dir, facts, lines=lines, before=before)

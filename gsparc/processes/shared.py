@@ -143,7 +143,7 @@ class Shared:
         white = (factor.whitened_rounded if rounded else factor.whitened)(cross.T).T
         if number not in self._weights:
             rest = (block.values - block.columns @ self.mean)[:, None]
-            self._weights[number] = torch.linalg.solve_triangular(factor.lower.mT, rest, upper=True)[:, 0]
+            self._weights[number] = factor.solved(factor.lower @ rest)[:, 0]
         more = columns @ self.mean + cross @ self._weights[number]
         if not len(self.mean):
             return _Said(prior, more, white, columns)

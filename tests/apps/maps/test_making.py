@@ -137,6 +137,17 @@ def test_ratio_and_overlap_are_within_one_carrier():
     assert found[0] == pytest.approx(-50 - 10 * np.log10(10**-5.4 + 10**-5.7)) and np.isnan(found[1])
 
 
+def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
+    stations = replace(predictor.site.stations, carrier_hz=np.array([8e8, 2.6e9]))
+    monkeypatch.setattr(predictor, "site", replace(predictor.site, stations=stations))
+    found = map_of(predictor, step_m=10.0)
+    drawn = {layer.name: layer.values for layer in layers(found)}
+    for number, band in enumerate(("800 MHz", "2600 MHz")):
+        np.testing.assert_array_equal(drawn[f"power {band}"], found.power_db[number])
+        assert (drawn[f"best_server {band}"] == 0).all()
+    assert (drawn["overlap"] == 1).all() and "sinr" not in drawn  # nobody interferes on another carrier
+
+
 def test_sectors_that_err_together_are_told_apart():
     """The chance of the best server took errors of sectors of one site for independent."""
     power, error = np.array([[-60.0], [-64.0]]), np.full((2, 1), 6.0)

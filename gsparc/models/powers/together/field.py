@@ -137,9 +137,10 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         every = link_rows(data, rows, self.places)
         every = every if self.network is None else by_site(every, self.network)
         used = every.thinned(most_each(len(every.stations)), self.seed)
-        few = used.thinned(UNHEARD_EACH, self.seed)
         self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
-        elsewhere = self.own.given(few, self.unheard, self.seed)
+        elsewhere = self.posterior
+        if self.network is None:  # sites share nothing that is learned here
+            elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = Shared({}, self.own.never, self.unheard.columns, (elsewhere.factor, elsewhere.mean))
         loud = used if used.silent.all() else used.loud
         self.whole = max(float(loud.decibels.var()), self.own.variance)
@@ -285,9 +286,8 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
 
     def _standing(self, places: Tensor) -> Tensor:
         """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
-        apart, number = torch.cdist(places.detach(), torch.from_numpy(self.places).nan_to_num(math.inf)).min(
-            1
-        )
+        table = torch.from_numpy(self.places).nan_to_num(math.inf)
+        apart, number = torch.cdist(places.detach(), table).min(1)
         return torch.where(apart <= SAME_PLACE_M, number, NEVER)
 
     def _power(self, decibels: Tensor) -> Tensor:
