@@ -19,13 +19,13 @@ from scenes import lobes, room
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.evaluation.experiment.fit import callbacks_of
+from gsparc.field.fit import DEFAULTS
+from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import HasGaussians
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
-from gsparc.training.fit import DEFAULTS
-from gsparc.training.optimizer import rate_factor
 
 SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 CHANNELS = ("gsrf", "ngrf", "newrf")
@@ -90,7 +90,7 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
         seen.append((step, total, rate_factor(kind, settings, step, total)))
         return seen[-1][2]
 
-    monkeypatch.setattr("gsparc.training.optimizer.rate_factor", noted)
+    monkeypatch.setattr("gsparc.field.optimizer.rate_factor", noted)
     for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 0)):
         method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
         build = method.build
@@ -166,6 +166,14 @@ def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory
     monkeypatch.chdir(tmp_path / "here")
     brief("swiftwrf").fit(data, fold, FitContext())
     assert list(Path().iterdir()) == []
+
+
+def test_a_peer_trains_on_the_cpu_whatever_the_trainer_says(tmp_path, caplog):
+    """Under the Trainer it would have been moved to a device, and its own tensors not."""
+    data, fold = lobes(tmp_path)
+    trainer = partial(DEFAULTS, accelerator="gpu", devices=1, strategy="ddp")
+    brief("nerf2", max_steps=2).fit(data, fold, FitContext(tmp_path, trainer=trainer))
+    assert "in one process on the CPU" in caplog.text
 
 
 def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsparc.training.optimizer import OptimizerSettings, kind_of, optimizer_for, rate_factor, scheduler_for
+from gsparc.field.optimizer import OptimizerSettings, kind_of, optimizer_for, rate_factor, scheduler_for
 
 SETTINGS = OptimizerSettings(positions=1e-3, positions_final=1e-5, decay=0.1)
 

@@ -23,10 +23,10 @@ from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.module import NetworkModule
+from gsparc.field.pace import SPENT, Budget
+from gsparc.field.processes import Processes
 from gsparc.training.context import FitContext
-from gsparc.training.module import NetworkModule
-from gsparc.training.pace import SPENT, Budget
-from gsparc.training.processes import Processes
 from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
@@ -211,6 +211,10 @@ def run_stage(
     options["max_epochs"] = -1
     heeded.count("trainer", "callbacks")
     processes = Processes.named(make.keywords.get("strategy"))
+    if module.count is None:  # networks of published methods make tensors of their own, on the CPU
+        if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
+            log.warning("published methods train in one process on the CPU, whatever trainer= says")
+        processes, options = None, {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"}
     if processes is not None:
         options["strategy"] = processes
     trainer = make(

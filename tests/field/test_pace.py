@@ -9,11 +9,11 @@ from clocks import wound
 from contexts import loaded, short
 
 from gsparc.commands.train import train
+from gsparc.field.pace import Budget
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
 from gsparc.training.context import FitContext
-from gsparc.training.pace import Budget
 from gsparc.training.time_budget import Spent, TimeBudget
 
 

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gsparc.field import edit
-from gsparc.training.fit import KEPT
-from gsparc.training.module import GaussianModule
-from gsparc.training.processes import agreed
+from gsparc.field.fit import KEPT
+from gsparc.field.module import GaussianModule
+from gsparc.field.processes import agreed
 
 log = logging.getLogger(__name__)
 

@@ -18,11 +18,11 @@ from gsparc.data.schema import Site
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
 from gsparc.field.initial import Snapshot
+from gsparc.field.losses import holds_window, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
+from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
+from gsparc.field.processes import count
 from gsparc.ops import UnsoundGaussian
-from gsparc.training.losses import holds_window, ssim, task_loss
-from gsparc.training.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
-from gsparc.training.processes import count
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def kind_of(name: str) -> str:
         if name == prefix or name.startswith(prefix + "."):
             return kind
     raise KeyError(
-        f"no learning rate is declared for parameter {name!r}: add it to gsparc.training.optimizer.KINDS"
+        f"no learning rate is declared for parameter {name!r}: add it to gsparc.field.optimizer.KINDS"
     )
 
 

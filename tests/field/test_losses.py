@@ -2,7 +2,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gsparc.training.losses import channel_loss, spectrum_loss, ssim
+from gsparc.field.losses import channel_loss, spectrum_loss, ssim
 
 
 def images(batch: int = 3, height: int = 20, width: int = 31, seed: int = 0) -> torch.Tensor:

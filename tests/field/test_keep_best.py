@@ -10,9 +10,9 @@ from contexts import loaded, short
 from lightning.pytorch.callbacks import EarlyStopping
 
 from gsparc.callbacks import CostLedger
+from gsparc.field.keep_best import _surely_less
 from gsparc.models.registry import build
 from gsparc.training import curve
-from gsparc.training.keep_best import _surely_less
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 

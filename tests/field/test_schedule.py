@@ -2,7 +2,7 @@
 
 import pytest
 
-from gsparc.training.schedule import FIRST, INTERVAL, STEPS, due, in_steps
+from gsparc.field.schedule import FIRST, INTERVAL, STEPS, due, in_steps
 
 
 @pytest.mark.parametrize(("given", "steps"), [(0, 0), (7, 7), (0.25, 100), (0.001, 1)])
