@@ -84,6 +84,7 @@ def propagate(
         both = (1 - DAMPING) / variance + DAMPING / wide
         value = ((1 - DAMPING) * value / variance + DAMPING * result / wide) / both
         variance = 1 / both
+    # The evidence of expectation propagation: Rasmussen and Williams 2006, eq. 3.65.
     apart = cavity_variance + variance
     evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
     evidence += torch.special.log_ndtr(side * (level - cavity) / cavity_variance.sqrt()).sum()
@@ -122,6 +123,7 @@ class ConditionalGaussian:
         """
         known = ~unknown
         factor = Factor.of(gram[known][:, known], "raise")
+        # Cross covariances and values in one solve.
         white = factor.whitened(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
         cross, white = white[:, :-1], white[:, -1]
         evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
@@ -167,6 +169,7 @@ def log_evidence(
     sites = propagate(known, values[unknown], side[unknown], last[0] if last else None)
     if last is not None:
         last[:] = [sites]
+    # A stand-in is a measurement whose noise is its own variance.
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)

@@ -66,6 +66,7 @@ class LeftOutDensity(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """dK^-1 = -K^-1 dK K^-1: the slopes by R = K^-1 Y and by diag(K^-1) become one by K."""
         inverse, ratio, by_ratio = ctx.saved_tensors
+        # These slopes are never positive: with their roots on both sides the product is symmetric.
         scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
         with BLAS.limit(limits=1):
             # One triangle of a symmetric product: half the multiplications of all of it.

@@ -81,6 +81,7 @@ class Factor:
         exact = exact.clone() if exact is covariance else exact
         bound, added = ROUNDING * float(exact.diagonal().real.sum()), 0.0
         for share in RIDGES:
+            # A ridge replaces the one before: what that added is part of it.
             exact.diagonal().add_(share * bound - added)
             added = share * bound
             lower, failed = _factored(exact)
@@ -184,6 +185,7 @@ def _alone(*parts: Tensor) -> bool:
 
 
 def _array(values: Tensor) -> np.ndarray:
+    # Conjugates and signs are lazy in torch; NumPy takes the numbers alone.
     return values.detach().resolve_conj().resolve_neg().numpy()
 
 
@@ -195,5 +197,6 @@ def _factored(covariance: Tensor) -> tuple[Tensor, bool]:
     transposed = _array(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
     potrf = get_lapack_funcs("potrf", (transposed,))
     with BLAS.limit(limits=1):
+        # A copy, as LAPACK factors in place and the caller keeps the covariance.
         upper, info = potrf(np.array(transposed, order="F"), lower=0, clean=1, overwrite_a=1)
     return torch.from_numpy(upper.T), bool(info)

@@ -209,6 +209,7 @@ def unpacked(parameters: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """Lengths, shares and noise of `Kernel.parameters()` (2,) or (4,), differentiable."""
     if len(parameters) == 2:
         return [parameters[0].exp()], [torch.ones_like(parameters[0])], parameters[1].exp()
+    # Of a logit both shares lie between 0 and 1, whatever a step does.
     share = torch.sigmoid(parameters[2])
     return list(parameters[:2].exp()), [share, 1 - share], parameters[3].exp()
 

@@ -60,6 +60,7 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
         most = int(size[order[-1]])  # the largest that is left, and as many as memory takes with it
         count = max(ENTRIES // most**2, 1)
         part, order = order[-count:], order[:-count]
+        # Members of a group come first, and in the order of rows as the sort is stable.
         index = near[part].to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
         valid = torch.arange(most) < size[part, None]
         block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])

@@ -162,6 +162,7 @@ class Nearest(Posterior):
         mean = torch.bmm(weights[:, None].to(rest.dtype), rest)[:, 0]
         left = 1 + self.prior.kernel.noise - known
         if self.prior.trend is not None:
+            # What the near rows leave open of the mean law's terms.
             unsure = self.prior.columns(queries) - torch.bmm(weights[:, None], self._columns[index])[:, 0]
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
@@ -230,6 +231,7 @@ def given(
         extra: see `more`.
         most: neighbours of a place.
     """
+    # The mean of n measurements has an n-th of their noise.
     noise, every = prior.kernel.noise / values.count, values
     if more is not None and extra is not None:
         noise = torch.cat([noise, prior.kernel.noise + extra])
@@ -266,6 +268,7 @@ def weighed(
     order = np.random.default_rng(seed).permutation(len(places))
     places, noise = places[order], noise[torch.from_numpy(order)]
     at, kernel = torch.from_numpy(places), prior.kernel
+    # Values and terms side by side: both are whitened by the same weights.
     both = torch.cat([rest[torch.from_numpy(order)], prior.columns(at)], 1)
     first = min(FIRST, len(places))
     gram = kernel.between(at[:first], at[:first])
@@ -284,6 +287,7 @@ def weighed(
         start = end
     flat, outputs = torch.cat(white), rest.shape[1]
     terms, values = flat[:, outputs:], flat[:, :outputs]
+    # Linear regression on white rows, whose weights have unit variance before.
     precision = Factor.of(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
     return precision.solved(terms.T @ values), precision.inverse
 

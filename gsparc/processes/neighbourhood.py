@@ -83,6 +83,7 @@ class Neighbourhood:
             sets.append(rows)
         level = np.full(len(places), len(sets), np.int8)
         for number, own in enumerate(sets):
+            # Sets were drawn from dense to sparse, and 0 is the sparsest.
             level[own] = len(sets) - 1 - number
         return cls(places, level)
 
@@ -100,6 +101,7 @@ class Neighbourhood:
         """Rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
         sparser = len(self._trees) - 1
         share = int(most * WIDER) // max(sparser, 1)
+        # The densest set has what the sparser ones leave, rounding included.
         counts = [most - share * sparser, *[share] * sparser]
         return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
 

@@ -89,6 +89,7 @@ class Exact(Posterior):
         if len(self.rows) <= MANY or not isinstance(self.prior.kernel, Kernel):
             return None
         terms = self.factor.whitened(self._columns)
+        # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
         spread = torch.eye(terms.shape[1], dtype=terms.dtype) - terms.T @ terms
         none, noise = self.rows.new_zeros(len(self.rows), 1), self.prior.kernel.noise + self.extra
         near = Neighbourhood.of(self.rows.numpy(), 0)

@@ -139,6 +139,7 @@ class PowerProcess:
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
         far = self.posterior.distance(queries) / self._reach
+        # What the law explains counts as unknown where no row is near.
         unknown = result.left / whole + by_law * (1 - (-far.square()).exp())
         return result.mean[:, 0], self.kernel.amplitude * result.left, unknown.clamp_max(1.0)
 
@@ -261,6 +262,7 @@ def _with_pseudo_values(
     deviation, mean = math.sqrt(prior.kernel.amplitude), prior.mean(places)[:, 0]
     gram = prior.between(places, places)
     gram.diagonal().add_(prior.kernel.noise)
+    # In deviations of the process, as its covariance has amplitude 1.
     unit = (decibels - mean) / deviation
     known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
     side = torch.from_numpy(rows.side)[silent]
@@ -269,6 +271,7 @@ def _with_pseudo_values(
     most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
     if len(near) > most:
         notes.append(f"{most} of {len(near)} rows near the level are used, those in doubt")
+        # Rows nearest to their level tell most; then back in the order of rows.
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):

@@ -89,6 +89,7 @@ class Sectors(Trend):
         """(n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         steps = STEP * torch.tensor(SHARED_SPREAD, dtype=torch.float64).diag()
         ends = self.at(places, self.shared + torch.cat([steps, -steps]), self.levels)
+        # Central differences, half a spread to either side.
         result = (ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)
         bands = torch.nn.functional.one_hot(self.band[places[:, 6].long()], len(self.levels)).to(places)
         return torch.cat([result.T, self.gain * bands], 1)
@@ -103,6 +104,7 @@ class Sectors(Trend):
         parts = [torch.full_like(slope, self.gain), *((ends[:3] - ends[3:]) / (2 * STEP)), slope]
         own = torch.stack(parts, 1) / self.unit
         which = torch.nn.functional.one_hot(self.rank[number], int(self.rank.max()) + 1).to(places)
+        # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         shared = self.columns(places) @ self.doubt / self.unit
         return torch.cat([(which[:, :, None] * own[:, None]).flatten(1), shared], 1)
 

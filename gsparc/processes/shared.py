@@ -167,6 +167,7 @@ def deviation_of(prior: Prior) -> float:
 def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
     """Factor of the precision (P, P) of the shared weights, and their mean (P,)."""
     size = blocks[0].columns.shape[1]
+    # From the identity, the precision of unit normal weights before any row.
     precision = sum((block.gram for block in blocks), torch.eye(size, dtype=torch.float64))
     factor = Factor.of(precision, "raise")
     right = torch.stack([block.columns.T @ block.values for block in blocks]).sum(0)

@@ -136,6 +136,7 @@ class Trend:
         """What is uncertain of the mean (n, P): a constant, a law's slope, losses in walls and floors."""
         parts = [torch.ones_like(places[:, :1])]
         if self.law is not None:
+            # Centred, so that slope and level are nearly independent.
             parts.append((self.law.decades(places)[:, None] - self.middle) / self.spread)
         return torch.cat(parts if self.walls is None else [*parts, self.walls.crossed(places)], 1)
 

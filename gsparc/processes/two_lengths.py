@@ -43,6 +43,7 @@ def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Ke
     """
     rows = covering(places, LEARNED_ON, 0)
     at = torch.from_numpy(places[rows])
+    # Parts of a circular value are independent and alike: twice as many outputs.
     real = torch.from_numpy(np.concatenate([values[rows].real, values[rows].imag], 1)).double()
     bounds = [
         *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
