@@ -93,6 +93,7 @@ class CostLedger(L.Callback):
     def _note(self, trainer: L.Trainer, module: Any) -> None:
         step, loss = trainer.global_step, trainer.callback_metrics.get("train/task_loss")
         shown = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
+        # What was solved before the first step is part of what an accuracy costs.
         row = curve.point(
             module.prepared_seconds + self.seconds, f"step {step}" if step else module.start,
             module.figures["val/error"], step, num_gaussians=module.count,

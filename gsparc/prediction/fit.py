@@ -89,6 +89,7 @@ def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> 
     if given.decibels:
         return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
     if "noise_variance" in arrays:
+        # A variance scales with the square of the unit.
         arrays = {**arrays, "noise_variance": arrays["noise_variance"] / given.scale**2}
     if powers.dtype.kind in "iuf":  # others are refused by name
         powers = powers / given.scale

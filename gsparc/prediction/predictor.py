@@ -245,6 +245,7 @@ class Predictor:
         stations = self._stations()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)
+        # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
         columns = [known * np.nan if one is None else one for one in answers]
         return torch.cat(columns, dim=-1) if isinstance(known, Tensor) else np.concatenate(columns, axis=-1)
 
@@ -460,6 +461,7 @@ def _predicted(method: Method, query: Query) -> Prediction:
 
 def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
     """Of stored targets, in a unit."""
+    # In decibels a variance depends on the mean too.
     variance = None if own.variance is None else unit.variance(own.mean, own.variance)
     explained = None if own.explained is None else unit.values(own.explained).to(own.mean.dtype)
     return Prediction(unit.values(own.mean).to(own.mean.dtype), variance, own.unknown, explained)

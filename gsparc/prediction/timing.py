@@ -96,6 +96,7 @@ def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
     times = []
     for number in range(turn * settings.calls, (turn + 1) * settings.calls):
         synchronise()
+        # A GPU works behind the call: the clock is read when it has nothing left to do.
         start = time.perf_counter()
         call(number)
         synchronise()
@@ -154,6 +155,7 @@ def machine_facts() -> dict[str, float | int | str | None]:
 
 def peak_memory() -> dict[str, float]:
     """`memory/peak_mb`: largest resident set of the process so far [MB]; `memory/gpu_peak_mb` with CUDA."""
+    # In bytes on macOS, in KiB on Linux.
     unit = 1 if sys.platform == "darwin" else 1024
     facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6}
     if torch.cuda.is_available() and torch.cuda.is_initialized():
