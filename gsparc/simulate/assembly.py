@@ -49,6 +49,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
     frequency = campaign.scene.frequency_hz
     images, peak = spectra(paths, campaign.spectrum, frequency, wavelength)
     strongest = np.zeros(len(paths))
+    # Unbuffered, as a receiver owns many paths.
     np.maximum.at(strongest, paths.owner, paths.power)
     stored = paths.select(paths.power >= strongest[paths.owner] * 10 ** (-campaign.weakest_db / 10))
     return {

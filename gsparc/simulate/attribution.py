@@ -105,6 +105,7 @@ class Probe:
         """(ports, C, R)."""
         kinds, which = self._kinds
         power, count = np.abs(self.paths.gain.astype(np.complex128)) ** 2, len(self.paths)
+        # One number for each pair of a kind and a receiver, so that one pass sums all.
         cell = which * count + self.paths.owner
         return np.stack([
             np.bincount(cell, weights=one, minlength=len(kinds) * count).reshape(-1, count) for one in power.T
@@ -151,6 +152,7 @@ class Probe:
             rest = self._channels[remaining.allows(*self._kinds[0].T)].sum(0)
             rest = rest if remaining.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
+        # A polarisation that is left out is missed whole.
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)

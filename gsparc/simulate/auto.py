@@ -191,6 +191,7 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
     early, late = settings.allowed_failures(heard, last)
     most = late if last else early
     rows = [_row(name, probe, less, required) for name, less in removals(full).items()]
+    # Neither clearly needed nor clearly not: all probes are to tell.
     if any(most < row.failures <= late for row in rows):
         return None
 
@@ -199,6 +200,7 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
         return bool((errors > required.tolerance).sum() <= most)
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
+    # The cheapest first: the search ends soon after the first set that holds.
     sets = sorted(combinations(full, removable), key=lambda effects: price(effects, full))
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:

@@ -50,6 +50,7 @@ def convergence(
     count = min(campaign.check, int(CHECKED * len(survey)))
     if count == 0 or not survey.engine.random:
         return None
+    # So many that enough remain when those traced otherwise are taken out.
     rows = survey.spread(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
     again = survey.trace(rows, effects, campaign.check_seed)

@@ -110,6 +110,7 @@ class Traced:
         if len(self._parts) < 2:
             return replace(choice, row_all=None, compiling=None)
         first = len(self._parts[0])
+        # The first part compiles: what it took beyond its rows at the others' pace is compiling.
         row_s = sum(self._costs[1:]) / (len(self.rows) - first)
         compiling = max(self._costs[0] - first * row_s, 0.0) if self.survey.engine.random else 0.0
         return replace(choice, row_all=row_s, compiling=compiling)

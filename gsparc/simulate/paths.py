@@ -67,6 +67,7 @@ class Paths:
     def take(self, receivers: np.ndarray) -> Paths:
         """Receivers (n,) alone, in this order."""
         counts = np.diff(self.offsets)[receivers]
+        # Rows of all paths without a loop: where a group begins here, less where it will begin.
         first = np.repeat(self.offsets[receivers] - starts(counts)[:-1], counts)
         rows = first + np.arange(counts.sum())
         return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
@@ -86,6 +87,7 @@ class Paths:
 
     def delay_spread(self) -> np.ndarray:
         """Root-mean-square delay spread (R,) [s]; 0 where nothing arrives."""
+        # Where nothing arrives 0 is divided by the least float64.
         total = np.maximum(self.received_power(), np.finfo(float).tiny)
         mean = self.per_receiver(self.power * self.delay) / total
         return np.sqrt(self.per_receiver(self.power * (self.delay - mean[self.owner]) ** 2) / total)

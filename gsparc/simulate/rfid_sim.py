@@ -52,6 +52,7 @@ def hand_moved(count: int, seed: int) -> np.ndarray:
     center, half = HAND_BOX.mean(axis=0), np.ptp(HAND_BOX, axis=0) / 2
     pieces = []
     for _ in range(-(-count // RUN_LENGTH)):
+        # White noise smoothed over time: the direction of a hand changes slowly.
         velocity = gaussian_filter1d(rng.normal(size=(RUN_LENGTH, 3)), SMOOTHING, axis=0, mode="wrap")
         velocity *= half / half.max()  # flatter in z than in y, as the box is
         velocity *= STEP / np.median(np.linalg.norm(velocity, axis=1))

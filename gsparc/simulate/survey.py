@@ -66,6 +66,7 @@ class Survey:
     def spread(self, count: int, seed: int) -> np.ndarray:
         """At most `count` rows far apart, transmitters by turns."""
         order, turns = spread(self.places, min(count, len(self.places)), seed), len(self.engines)
+        # Place i with transmitter i, then every place with the next one: all have their turn.
         rounds = [
             order + (np.arange(len(order)) + shift) % turns * len(self.places) for shift in range(turns)
         ]
@@ -78,6 +79,7 @@ class Survey:
         parts = [
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
+        # Traced by transmitter, returned in the order asked for.
         return join(parts).take(np.argsort(order, kind="stable"))
 
 

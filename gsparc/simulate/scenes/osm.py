@@ -192,6 +192,7 @@ def _extruded(shape: Any, low: float, high: float, origin: Georeference) -> Any:
         return origin.from_degrees(corners[:, 1], corners[:, 0])
 
     flat = shapely.make_valid(shapely.transform(shapely.force_2d(shape), metres))
+    # Below a square metre: slivers that repairing a footprint leaves.
     parts = [p for p in _polygons(flat) if p.area > 1.0]
     if not parts:
         return None

@@ -186,6 +186,7 @@ def _steps(line: np.ndarray, spacing: float) -> np.ndarray:
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     if along[-1] / spacing > MOST:
         raise ValueError(f"scene.receivers: over {MOST:,} places along {along[-1]:.3g} m")
+    # The end of the line counts, however its length was rounded.
     steps = np.arange(0.0, along[-1] + 1e-9, spacing)
     return np.column_stack([np.interp(steps, along, line[:, i]) for i in range(2)])
 
@@ -227,9 +228,13 @@ def place(
     allowed: Callable[[np.ndarray], np.ndarray],
     seed: int,
 ) -> np.ndarray:
-    """`count` positions (S, 3) float64 [m], uniform over an area where `allowed` is True.
+    """Draw `count` positions (S, 3) float64 [m], uniform over an area where `allowed` is True.
 
     A larger count begins with the positions of a smaller one.
+
+    >>> area = np.array([[0.0, 0.0], [9.0, 9.0]])
+    >>> place(5, area, (1.2, 1.8), lambda points: points[:, 0] > 3, seed=0).shape
+    (5, 3)
 
     Args:
         area: (2, 2) [m] lower and upper corner in x and y.
@@ -245,6 +250,7 @@ def place(
     rng = np.random.default_rng(seed)
     places = np.empty((0, 3))
     for _ in range(TRIES * -(-count // DRAWN)):
+        # Always as many at a time: what is drawn does not depend on the count.
         sample = rng.uniform(low, high, size=(DRAWN, 3))
         places = np.concatenate([places, sample[allowed(sample)]])
         if len(places) >= count:
@@ -265,6 +271,7 @@ def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndar
         for corners in walls:
             normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
             normal /= np.linalg.norm(normal)
+            # Distance to the plane of a sheet; its box bounds the rest.
             near = np.abs((points - corners[0]) @ normal) < margin
             low, high = corners.min(0) - margin, corners.max(0) + margin
             free &= ~(near & np.all((points >= low) & (points <= high), axis=1))
@@ -274,16 +281,25 @@ def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndar
 
 
 def spread(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Rows (count,) of positions far apart: farthest-point order from a seeded start."""
+    """Choose rows (count,) of positions far apart: farthest-point order from a seeded start.
+
+    >>> spread(np.array([[0.0], [0.1], [9.0], [9.1]]), count=2, seed=0).shape
+    (2,)
+    """
     count = min(count, len(positions))
     chosen = [int(np.random.default_rng(seed).integers(len(positions)))]
     distance = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < count:
         chosen.append(int(distance.argmax()))
+        # To the nearest of those chosen so far.
         distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
     return np.array(chosen)
 
 
 def neighbours(positions: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The nearest other row of each of `rows`."""
+    """Return the nearest other row of each of `rows`.
+
+    >>> neighbours(np.array([[0.0], [1.0], [9.0]]), rows=np.array([2]))
+    array([1])
+    """
     return cKDTree(positions).query(positions[rows], k=2)[1][:, 1]

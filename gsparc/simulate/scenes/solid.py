@@ -33,18 +33,27 @@ class Solid:
 
 
 def sheet(name: str, material: str, corner: ArrayLike, first: ArrayLike, second: ArrayLike) -> Solid:
-    """A parallelogram from `corner` along two sides (3,) [m]."""
+    """Build a parallelogram from `corner` along two sides (3,) [m].
+
+    >>> sheet("floor", "concrete", (0, 0, 0), (4, 0, 0), (0, 3, 0)).vertices[2].tolist()
+    [4.0, 3.0, 0.0]
+    """
     start, a, b = (np.asarray(v, dtype=np.float64) for v in (corner, first, second))
     vertices = np.stack([start, start + a, start + a + b, start + b])
     return Solid(name, material, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: float = 0.0) -> Solid:
-    """A box between corners (3,) [m], turned about its upright axis by `turn` [rad]; faces look outwards."""
+    """Build a box between corners (3,) [m], turned upright by `turn` [rad]; faces look outwards.
+
+    >>> box("table", "wood", (0, 0, 0.7), (2, 1, 0.74)).faces.shape  # two triangles a side
+    (12, 3)
+    """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     unit = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
     offset = (unit - 0.5) * (high - low)
     cosine, sine = np.cos(turn), np.sin(turn)
+    # Corners are rows: this is the transpose of the rotation by `turn`.
     offset[:, :2] = offset[:, :2] @ np.array([[cosine, sine], [-sine, cosine]])
     faces = np.array([
         [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
