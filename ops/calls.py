@@ -68,6 +68,7 @@ def call_for(
     call.sizes[: len(sizes)] = sizes
     if numbers:
         call.numbers[: len(numbers)] = numbers
+    # An absent tensor is a null pointer.
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
     struct.pack_into(f"{len(addresses)}Q", call, Call.tensors.offset, *addresses)  # ctypes takes far longer
     if settings is not None:
@@ -86,6 +87,7 @@ def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int
         return getattr(kernels(), name)(ctypes.addressof(call))
     device, library = like.device, libraries[like.device.type]
     with torch.cuda.device(device) if like.is_cuda else nullcontext():
+        # Called without scratch memory a kernel says how many bytes it needs.
         scratch = torch.empty(library.run(name, call), dtype=torch.uint8, device=device)
         call.scratch = scratch.data_ptr()
         call.stream = torch.cuda.current_stream(device).cuda_stream if like.is_cuda else 0

@@ -111,6 +111,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     else:
         status, capacity = verdict.tolist()
         validation.raise_for_status(status, plan.pose)
+        # For graphs captured later, which have room for the largest plan so far.
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
     entries = means.new_empty(starts + 2 * capacity, dtype=torch.int32)

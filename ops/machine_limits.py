@@ -23,6 +23,7 @@ def copy(source: Tensor, target: Tensor) -> int:
     size = source.numel() * source.element_size()
     if not source.is_contiguous() or not target.is_contiguous() or size != target.nbytes:
         raise ValueError("copying needs two contiguous tensors of the same size")
+    # Each byte is read once and written once.
     return 2 * calls.run("mark_copy", source, source, target, numbers=(size,))
 
 

@@ -72,6 +72,7 @@ def nearest_weights(
         lengths, shares: of one or two Matern-3/2 [m].
     """
     weights, known = queries.new_empty(rows.shape), queries.new_empty(len(queries))
+    # The kernel sums two: of a single one the second has no share.
     two = [*shares, 0.0][:2] + [*lengths, 1.0][:2]
     inputs = contiguous((queries, places, noise, rows))
     sizes = (*queries.shape, rows.shape[1])

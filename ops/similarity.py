@@ -58,6 +58,7 @@ def _cuda(
     stability: Sequence[float],
     slope: bool,
 ) -> tuple[Tensor, Tensor]:
+    # A symmetric window is passed up to its middle.
     half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
     radius, known = len(half) - 1, calls.kernels()
     if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
@@ -65,6 +66,7 @@ def _cuda(
         raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
     rows, columns = height - 2 * radius, width - 2 * radius
     blocks = -(-rows // known.SIMILARITY_HEIGHT) * -(-columns // known.SIMILARITY_WIDTH)
+    # A sum for each block of pixels, added up in a fixed order below.
     sums = prediction.new_empty(samples, blocks)
     inputs = (prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1)))
     if samples:
