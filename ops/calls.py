@@ -20,7 +20,7 @@ libraries: dict[str, Any] = {}
 
 @cache
 def kernels() -> Any:
-    """The compiled CPU kernels with the constants of csrc/layout.h; None where no compiler was at hand."""
+    """Return the compiled CPU kernels with the constants of csrc/layout.h; None where none were built."""
     try:
         from gsparc.ops import _native
     except ImportError:
@@ -63,7 +63,7 @@ def call_for(
     numbers: Sequence[float] = (),
     settings: KernelSettings | None = None,
 ) -> Call:
-    """A call in the precision and on the device of `like`; the caller keeps the tensors alive."""
+    """Return a call in the precision and on the device of `like`; the caller keeps the tensors alive."""
     call = Call(like.dtype == torch.float64, torch.get_num_threads(), max(like.get_device(), 0))
     call.sizes[: len(sizes)] = sizes
     if numbers:

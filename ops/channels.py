@@ -17,7 +17,7 @@ from gsparc.ops.transforms import beyond_kernels
 def channels(
     gains: Tensor, steering: Tensor, delays: Tensor, first_hz: float, step_hz: float, subcarriers: int
 ) -> Tensor:
-    """H[b, a, k] = sum_n gains[b, n] steering[n, a] exp(-j 2 pi f_k delays[n]), f_k = first + k step.
+    """Sum H[b, a, k] = sum_n gains[b, n] steering[n, a] exp(-j 2 pi f_k delays[n]), f_k = first + k step.
 
     Complex numbers are pairs of real ones on the last axis; differentiable in every tensor.
 
@@ -64,7 +64,7 @@ def channels(
 def summed(
     gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float], subcarriers: int
 ) -> Tensor:
-    """The same (B, A, K, 2) in plain PyTorch; the reference. `tones`: first and spacing [Hz]."""
+    """Return the same (B, A, K, 2) in plain PyTorch; the reference. `tones`: first and spacing [Hz]."""
     numbers = torch.arange(subcarriers, dtype=torch.float64, device=gains.device)
     turns = torch.outer(delays, tones[0] + tones[1] * numbers)
     # Whole turns go first: 2 pi times 1e6 turns would round six digits of the phase away.

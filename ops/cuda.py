@@ -47,7 +47,7 @@ def load() -> None:
 
 
 def tiles(settings: KernelSettings) -> int:
-    """Tiles of one pose's image."""
+    """Count the tiles of one pose's image."""
     return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
 
 
@@ -72,7 +72,7 @@ def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) 
 
 
 def capacity_of(plan: Plan) -> int:
-    """How many entries a plan has room for."""
+    """Return how many entries a plan has room for."""
     return (plan.buffers.entries.numel() - plan.num_poses * tiles(plan.settings) - 1) // 2
 
 
@@ -187,7 +187,7 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Order (V,) of the visible Gaussians; tiles' starts and ends, each entry's rank and 32 weights."""
+    """Return the order (V,) of visible Gaussians; tiles' starts and ends, entries' ranks and 32 weights."""
     means, buffers, capacity = gaussians.means, plan.buffers, capacity_of(plan)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
     check_memory(capacity, pixels * means.element_size())
@@ -206,7 +206,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 def thaw(
     grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
 ) -> Tensor:
-    """Images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
+    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
     columns = validation.seen_features(features, order, picked).contiguous()
     image = columns.new_empty(columns.shape[1], grid.height, grid.width)
     if image.numel():

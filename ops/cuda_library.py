@@ -68,7 +68,7 @@ class Library:
 
 
 def load() -> Library:
-    """The library for this machine's GPUs, built if need be (LibraryUnavailable)."""
+    """Return the library for this machine's GPUs, built if need be (LibraryUnavailable)."""
     reason = missing_device()
     if reason:
         raise LibraryUnavailable(reason)
@@ -86,7 +86,7 @@ def load() -> Library:
 
 
 def missing_device() -> str | None:
-    """Why this process cannot use a GPU, or None."""
+    """Say why this process cannot use a GPU, or None."""
     if torch.version.cuda is None:
         return f"this PyTorch ({torch.__version__}) was built without CUDA; install a CUDA build of torch"
     if torch.cuda.is_available():
@@ -105,7 +105,7 @@ def architectures() -> list[str]:
 
 
 def compiler() -> str | None:
-    """Path of nvcc, or None."""
+    """Return the path of nvcc, or None."""
     homes = [os.environ.get(name) for name in ("CUDA_HOME", "CUDA_PATH")]
     for home in [*homes, "/usr/local/cuda"]:
         if home and (Path(home) / "bin" / "nvcc").exists():
@@ -114,13 +114,13 @@ def compiler() -> str | None:
 
 
 def library_path(*architectures: str) -> Path:
-    """Where the library of these sources for these GPUs is kept between runs."""
+    """Return where the library of these sources for these GPUs is kept between runs."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "gsparc" / f"cuda-{'-'.join(architectures)}-{fingerprint(*FLAGS)}.so"
 
 
 def fingerprint(*also: str) -> str:
-    """Hash of the sources and of `also`, such as compiler flags."""
+    """Return the hash of the sources and of `also`, such as compiler flags."""
     digest = hashlib.sha256(repr(also).encode())
     for source in sorted([*SOURCES.glob("*.h"), *SOURCES.glob("projection/*"), *SOURCES.glob("cuda/*")]):
         digest.update(source.name.encode() + source.read_bytes())
@@ -128,7 +128,7 @@ def fingerprint(*also: str) -> str:
 
 
 def cuda_sources() -> list[str]:
-    """The sources to compile."""
+    """Return the sources to compile."""
     return sorted(str(unit) for unit in (SOURCES / "cuda").glob("*.cu"))
 
 
@@ -148,7 +148,7 @@ def build(path: Path, *architectures: str) -> None:
 
 
 def target(nvcc: str, arch: str) -> str:
-    """nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
+    """Return nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
     listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
     known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})
     if not known or int(arch) in known:

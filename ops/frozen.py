@@ -36,7 +36,7 @@ class FrozenPlan:
 
     @torch.no_grad()
     def render(self, features: Tensor, version: int) -> Tensor:
-        """Image (C, H, W) of features (N, C), or (B, C, H, W) of (B, N, C); not differentiable.
+        """Return the image (C, H, W) of features (N, C), or (B, C, H, W) of (B, N, C); not differentiable.
 
         Raises:
             StalePlan: if `version`, the field's counter now, is not the one this view was made from.
@@ -51,7 +51,7 @@ class FrozenPlan:
 
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
-        """As `render`, of features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
+        """Render as `render` does, features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
         if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
             count = len(self.order)
             raise ValueError(

@@ -69,7 +69,7 @@ class Pose:
         return Pose(self.position[index], self.rotation[index])
 
     def to(self, *args, **kwargs) -> Pose:
-        """The same poses with another dtype or on another device."""
+        """Return the same poses with another dtype or on another device."""
         return Pose(self.position.to(*args, **kwargs), self.rotation.to(*args, **kwargs))
 
     def local(self, points: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ def copy(source: Tensor, target: Tensor) -> int:
 
 
 def pairs(plan: Plan) -> int:
-    """Pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses.
+    """Count pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses.
 
     Raises:
         ValueError: a plan of another backend.

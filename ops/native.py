@@ -57,7 +57,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
 def rasterize(
     gaussians: Gaussians, ids: Tensor | None, pose: Pose, features: Tensor, settings: KernelSettings
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What a `Raster` holds, in one call that keeps no plan and passes no gradient.
+    """Return what a `Raster` holds, in one call that keeps no plan and passes no gradient.
 
     Raises:
         ValueError, MemoryError: as `make_plan` and `composite`.
@@ -118,7 +118,7 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Order (V,) of the visible Gaussians, and the weights alpha T as blocks of pixels; see frozen.h."""
+    """Return the order (V,) of visible Gaussians, and weights alpha T as blocks of pixels; see frozen.h."""
     rows, grid, run = _native.STRIP_ROWS, plan.grid, partial(run_on_plan, "freeze", plan, gaussians)
     counts = torch.zeros(
         strips(grid.height) * grid.width + 1, dtype=torch.int64
@@ -138,7 +138,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 def thaw(
     grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
 ) -> Tensor:
-    """Images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C).
+    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C).
 
     Raises:
         ValueError: features that are not finite, or not as many as `order` speaks of.
@@ -154,5 +154,5 @@ def thaw(
 
 
 def instruction_set() -> str:
-    """Name of the kernels in use: baseline, avx2 or avx512."""
+    """Return the name of the kernels in use: baseline, avx2 or avx512."""
     return _native.instruction_set()

@@ -44,7 +44,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
 
 @full_precision
 def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
-    """The same (B, N, C) as matrix products; the reference."""
+    """Return the same (B, N, C) as matrix products; the reference."""
     count, width, hidden = weight1.shape
     # One product for all Gaussians: the encoded position is the same for each of them.
     inner = (encoded @ weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(

@@ -65,7 +65,7 @@ def kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
 
 
 def fill(name: str, like: Tensor, out: Any, *values: Any) -> Any:
-    """Outputs of operator `name` on the device of `like`, given the empty ones `out` and its arguments."""
+    """Fill the empty outputs `out` of operator `name` on the device of `like`, given its arguments."""
     if like.is_meta:
         return out  # shapes alone
     own = KERNELS[like.device.type][name](out, *values)
@@ -111,7 +111,7 @@ def differentiable(
     *tensors: Tensor | None,
     reads_outputs: bool = False,
 ) -> Any:
-    """`operator(fixed, *tensors)`; `gradient(fixed, *slopes, *tensors)` is its derivative.
+    """Call `operator(fixed, *tensors)`; `gradient(fixed, *slopes, *tensors)` is its derivative.
 
     A slope is None where nothing depends on that output; at least one is given. Where the gradient reads the
     outputs they stand behind the slopes, and nobody may write into them.
@@ -122,18 +122,18 @@ def differentiable(
 
 
 def strips(height: int) -> int:
-    """Strips of an image so many rows high."""
+    """Count the strips of an image so many rows high."""
     # Rounded up: the last strip may be cut off.
     return -(-height // calls.kernels().STRIP_ROWS)
 
 
 def empty_like(tensors: Any) -> Any:
-    """The named tuple of contiguous empty tensors shaped as those of `tensors`, None where there is none."""
+    """Return the named tuple of contiguous empty tensors shaped as those of `tensors`; None stays."""
     return type(tensors)(*(None if t is None else t.new_empty(t.shape) for t in tensors))
 
 
 def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
-    """Contiguous tensors, as kernels read them."""
+    """Return contiguous tensors, as kernels read them."""
     return [t if t is None or t.is_contiguous() else t.detach().contiguous() for t in tensors]
 
 
@@ -176,7 +176,7 @@ def composite_gradient(
     features: Tensor,
     *parts: Tensor,
 ) -> tuple[Tensor | None, ...]:
-    """Gradients of means2d, features and the Gaussians' `parts`, given those of image and transmittance."""
+    """Return gradients of means2d, features and `parts`, given those of image and transmittance."""
     gaussians, slope = Gaussians(*parts), torch.zeros_like(image) if grad_image is None else grad_image
     out = empty_like(gaussians), features.new_empty(features.shape), means2d.new_empty(means2d.shape)
     values = slope, grad_transmittance, image, transmittance, features
@@ -185,7 +185,7 @@ def composite_gradient(
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Image (B, C, H, W), transmittance (P, H, W) of features (B, N, C); `means2d` only gets a gradient."""
+    """Return image (B, C, H, W), transmittance (P, H, W) of (B, N, C); `means2d` only gets a gradient."""
     inputs = means2d, features, *gaussians
     return differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
 
@@ -205,13 +205,13 @@ def _weights_gradient(
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = differentiable(_weights, _weights_gradient, plan, *gaussians)
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
 def check_memory(entries: int, bytes_each: int) -> None:
-    """MemoryError, in one line, where entries would need more than `MEMORY_BOUND`."""
+    """Raise MemoryError, in one line, where entries would need more than `MEMORY_BOUND`."""
     if entries * bytes_each > MEMORY_BOUND:
         raise MemoryError(
             f"{entries} footprint entries need {entries * bytes_each / 2**30:.1f} GiB, the bound is "

@@ -12,7 +12,7 @@ from gsparc.ops.transforms import followed
 
 
 def served(*tensors: Tensor) -> bool:
-    """Whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
+    """Tell whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
     plain = all(part.device.type == "cpu" for part in tensors) and not followed(*tensors)
     return plain and calls.kernels() is not None
 
@@ -25,7 +25,7 @@ def array_spectrum(
     square: Tensor,
     numbers: tuple[float, float, float, float],
 ) -> tuple[Tensor, Tensor]:
-    """Spectra (B, H, W) in [0, 1] of an array, and unknown shares (B,), of places (B, D) [m]; all float32.
+    """Return spectra (B, H, W) in [0, 1] of an array, and unknown shares (B,), at (B, D) [m]; all float32.
 
     Args:
         places: where the moving end is.
@@ -61,7 +61,7 @@ def nearest_weights(
     lengths: Sequence[float],
     shares: Sequence[float],
 ) -> tuple[Tensor, Tensor] | None:
-    """Weights (B, k) of near rows in the mean of a process, and what they take off its variance of 1 (B,).
+    """Return weights (B, k) of near rows in a process's mean, and what they take off its variance 1 (B,).
 
     None where a covariance has no Cholesky factor.
 

@@ -183,7 +183,7 @@ def mean_weights(
     *,
     extinctions: Tensor | None = None,
 ) -> Weights:
-    """Visible weight of each Gaussian for each pose, by a plan of the same Gaussians; differentiable.
+    """Return each Gaussian's visible weight for each pose, by a plan of the same ones; differentiable.
 
     Raises:
         ValueError, TypeError, RuntimeError: as `composite`.
@@ -205,7 +205,7 @@ def freeze(
     version: int,
     extinctions: Tensor | None = None,
 ) -> FrozenPlan:
-    """Compositing weights of one static receiver as a sparse pixel x Gaussian matrix, valid for `version`.
+    """Store one static receiver's weights as a sparse pixel x Gaussian matrix, valid for `version`.
 
     `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
     counter misses writes through `.data`.

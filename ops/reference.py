@@ -71,7 +71,7 @@ def _norm(vectors: Tensor) -> Tensor:
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, pose: Pose, grid: SphereGrid, optics: Optics
 ) -> Projected:
-    """Footprints of N Gaussians for one pose (position (3,), rotation (3, 3))."""
+    """Return footprints of N Gaussians for one pose (position (3,), rotation (3, 3))."""
     local = pose.local(means)
     with torch.no_grad():
         distance = _norm(local)
@@ -142,7 +142,7 @@ def project(
 
 
 def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor) -> Tensor:
-    """The Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them.
+    """Return the Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them.
 
     `shift` (N, 2) [px] moves the footprints; it is zero and carries the screen-space gradient.
     """
@@ -156,7 +156,7 @@ def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor)
 
 
 def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
-    """Indices (N,) from near to far, equal distances by id."""
+    """Return indices (N,) from near to far, equal distances by id."""
     by_id = (
         torch.arange(len(seen.distance), device=seen.distance.device) if ids is None else torch.argsort(ids)
     )
@@ -167,7 +167,7 @@ def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
 def layers(
     seen: Projected, shapes: Tensor, opacities: Tensor, extinctions: Tensor, optics: Optics
 ) -> tuple[Tensor, Tensor]:
-    """Opacity alpha and extinction gamma of each layer at each pixel (N, H W), before occlusion."""
+    """Return opacity alpha and extinction gamma of each layer at each pixel (N, H W), before occlusion."""
     emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
     strongest = torch.maximum(emits, hides)
     strength = shapes if optics.cutoff.relative else strongest
@@ -195,7 +195,7 @@ def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
 
 
 def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:
-    """Long half axes (N,) [px] of the footprints at the cut-off of opacities (or extinctions) `strongest`."""
+    """Return long half axes (N,) [px] at the cut-off of opacities (or extinctions) `strongest`."""
     k11, k12, k22 = seen.covariance.unbind(-1)
     # The larger eigenvalue of a symmetric 2 x 2 matrix; `hypot` does not overflow where squares would.
     largest = (k11 + k22) / 2 + torch.hypot((k11 - k22) / 2, k12)

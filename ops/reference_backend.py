@@ -17,7 +17,7 @@ from gsparc.ops.transforms import full_precision
 
 @full_precision
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
-    """Depth order and radii; compositing evaluates the footprints again, differentiably."""
+    """Find depth order and radii; compositing evaluates the footprints again, differentiably."""
     validation.finite(gaussians, pose)
     means, quats, scales, strongest, _ = gaussians
     orders, centers, radii, visible = [], [], [], []
@@ -44,7 +44,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
 
 @full_precision
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
+    """Return the image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
     images, transmittances = [], []
     for index, values in enumerate(per_pose):
@@ -61,7 +61,7 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
 
 @full_precision
 def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Sums over pixels of alpha T and of alpha, both (P, N)."""
+    """Return sums over pixels of alpha T and of alpha, both (P, N)."""
     seen, total = [], []
     no_shift = torch.zeros_like(plan.means2d)
     for index in range(plan.num_poses):
@@ -75,14 +75,14 @@ def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = weight_sums(plan, gaussians)
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
 @full_precision
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
+    """Return the depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
     no_shift = torch.zeros_like(plan.means2d)
     weights, _, _ = _weights(plan, 0, gaussians, no_shift)
     return plan.buffers[0][0], (weights,)
@@ -92,7 +92,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 def thaw(
     grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
 ) -> Tensor:
-    """Images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
+    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
     columns = validation.seen_features(features, order, picked)
     return (columns.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 

@@ -20,14 +20,14 @@ ELEMENTS = 2**22  # of a tensor Gaussians x pixels
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C), by a plan of any backend."""
+    """Return image (B, C, H, W), transmittance (P, H, W) of features (B, N, C), by any backend's plan."""
     parts = [reference_backend.composite(part, gaussians, features, means2d) for part in _in_rows(plan)]
     images, transmittances = zip(*parts, strict=True)
     return torch.cat(images, -2), torch.cat(transmittances, -2)
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     parts = [reference_backend.weight_sums(part, gaussians) for part in _in_rows(plan)]
     seen, total = (torch.stack(sums).sum(0) for sums in zip(*parts, strict=True))
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)

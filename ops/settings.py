@@ -110,7 +110,7 @@ class KernelSettings(NamedTuple):
 
 @lru_cache(maxsize=64)
 def kernel_settings(grid: SphereGrid, optics: Optics) -> KernelSettings:
-    """What a grid and optics are to the kernels."""
+    """Return what a grid and optics are to the kernels."""
     return KernelSettings(
         height=grid.height,
         width=grid.width,

@@ -13,7 +13,7 @@ from gsparc.ops.transforms import beyond_kernels
 
 
 def served(images: Tensor) -> bool:
-    """Whether a kernel supports these images: float32, on a device whose kernels are loaded."""
+    """Tell whether a kernel supports these images: float32, on a device whose kernels are loaded."""
     device = images.device.type
     if beyond_kernels(images):
         return False
@@ -24,7 +24,7 @@ def served(images: Tensor) -> bool:
 def similarity_op(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
 ) -> tuple[Tensor, Tensor]:
-    """Similarity (B,) of float32 images (B, H, W), and its gradient by the prediction (empty unless `slope`).
+    """Return the similarity (B,) of float32 images (B, H, W), and its gradient (empty unless `slope`).
 
     `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
     A GPU takes no window that is not symmetric or too wide (ValueError).

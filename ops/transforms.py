@@ -16,18 +16,18 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def full_precision(function: _Function) -> _Function:
-    """`function` in the precision of its tensors, as the kernels are, under `torch.autocast` too."""
+    """Keep `function` in the precision of its tensors, as the kernels are, under `torch.autocast` too."""
     exact = torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(function))
     return cast(_Function, exact)
 
 
 def differentiated_forward() -> bool:
-    """Whether forward mode is under way anywhere: this is asked at every call."""
+    """Tell whether forward mode is under way anywhere: this is asked at every call."""
     return forward_ad._current_level >= 0
 
 
 def carries_tangent(*values: Any) -> bool:
-    """Whether a tensor among `values` is differentiated in forward mode, by `torch.func.jvp` for example."""
+    """Tell whether a tensor among `values` is differentiated in forward mode, as by `torch.func.jvp`."""
     if not differentiated_forward():
         return False
     tensors = (v for v in values if isinstance(v, Tensor) and v.is_floating_point())
@@ -35,7 +35,7 @@ def carries_tangent(*values: Any) -> bool:
 
 
 def mapped(*values: Any) -> bool:
-    """Whether `torch.vmap` has hidden an axis of a tensor among `values`."""
+    """Tell whether `torch.vmap` has hidden an axis of a tensor among `values`."""
     for value in values if transforming() else ():
         while isinstance(value, Tensor) and _functorch.is_functorch_wrapped_tensor(value):
             if _functorch.is_batchedtensor(value):
@@ -45,7 +45,7 @@ def mapped(*values: Any) -> bool:
 
 
 def unwrapped(value: Tensor, axis: int) -> tuple[Tensor, int]:
-    """The numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
+    """Return the numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
     while _functorch.is_functorch_wrapped_tensor(value):
         hidden = _functorch.maybe_get_bdim(value)
         # A hidden axis at or before it moves it back by one.
@@ -55,32 +55,32 @@ def unwrapped(value: Tensor, axis: int) -> tuple[Tensor, int]:
 
 
 def transforming() -> bool:
-    """Whether a transform of `torch.func` is under way."""
+    """Tell whether a transform of `torch.func` is under way."""
     return torch._C._are_functorch_transforms_active()
 
 
 def beyond_kernels(*values: Any) -> bool:
-    """Whether plain PyTorch must compute what a kernel would answer without its derivative, or not at all."""
+    """Tell whether plain PyTorch must compute what a kernel has no derivative of, or no answer to."""
     return transforming() or carries_tangent(*values)
 
 
 def followed(*values: Tensor | None) -> bool:
-    """Whether autograd, in either mode, or `torch.func` follows any of these."""
+    """Tell whether autograd, in either mode, or `torch.func` follows any of these."""
     recorded = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in values)
     return recorded or beyond_kernels(*values)
 
 
 def unfollowed() -> AbstractContextManager[Any]:
-    """Within, transforms of `torch.func` do not see what is computed."""
+    """Return a context within which transforms of `torch.func` do not see what is computed."""
     return torch._C._DisableFuncTorch() if transforming() else nullcontext()
 
 
 def plain(value: Tensor | None) -> Any:
-    """The numbers behind a tensor or None, for choices without a derivative; used within `unfollowed`."""
+    """Return the numbers behind a tensor or None, for choices without a derivative, in `unfollowed`."""
     return None if value is None else unwrapped(value, 0)[0].detach()
 
 
 def numbers(value: Tensor) -> np.ndarray:
-    """The numbers of a tensor without what follows them, for choices that have no derivative."""
+    """Return the numbers of a tensor without what follows them, for choices that have no derivative."""
     with unfollowed():
         return plain(value).cpu().numpy()

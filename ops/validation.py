@@ -40,7 +40,7 @@ def gaussians(
     extinctions: Tensor | None,
     ids: Tensor | None,
 ) -> Gaussians:
-    """Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
+    """Return Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
     n = means.shape[0] if means.dim() else 0
     result = Gaussians(means, quats, scales, opacities, extinctions)
     expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
@@ -100,7 +100,7 @@ def _wrongness(pose: Pose) -> Tensor:
 
 
 def strongest(gaussians: Gaussians) -> Gaussians:
-    """Gaussians with max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
+    """Take max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
     opacities, extinctions = gaussians.opacities, gaussians.extinctions
     if extinctions is None:
         return gaussians
@@ -147,7 +147,7 @@ def raise_for_ids() -> None:
 
 
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
-    """Features (N, C) or (B, N, C) as (B, N, C), as many as Gaussians and poses (ValueError, TypeError)."""
+    """Return features (N, C) or (B, N, C) as (B, N, C), one a Gaussian and pose (ValueError, TypeError)."""
     _check_dtype_and_device("features", values, means)
     if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
         raise ValueError(
@@ -174,7 +174,7 @@ def check_features(values: Tensor, rows: Tensor | None = None) -> None:
 
 
 def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
-    """Features (B, N, C) of `order` (V,), or those already `picked`, side by side (V, B C).
+    """Return features (B, N, C) of `order` (V,), or those already `picked`, side by side (V, B C).
 
     Raises:
         ValueError: features that are not finite or too few, on the CPU.
@@ -187,7 +187,7 @@ def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:
-    """Poses (P,) in the Gaussians' dtype, on their device and batched (TypeError); the plan checks values."""
+    """Return poses (P,) in the Gaussians' dtype, on their device (TypeError); the plan checks values."""
     for name, part in vars(pose).items():
         if part.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"a pose needs float32 or float64, got a {name} in {part.dtype}; convert it")
