@@ -181,7 +181,7 @@ class Densify(Checked, L.Callback):
         return chosen
 
     def state_dict(self) -> dict[str, Any]:
-        """Statistics gathered since the last edit."""
+        """Return statistics gathered since the last edit."""
         return {"statistics": dict(self.statistics), "ended": self._ended}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

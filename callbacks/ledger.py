@@ -36,7 +36,7 @@ class CostLedger(L.Callback):
 
     @staticmethod
     def seconds_in(trainer: L.Trainer) -> float | None:
-        """Seconds on the trainer's ledger [s]; None when it keeps none."""
+        """Return seconds on the trainer's ledger [s]; None when it keeps none."""
         ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
         return ledgers[0].elapsed() if ledgers else None
 
@@ -104,7 +104,7 @@ class CostLedger(L.Callback):
         curve.log(trainer.loggers, row)
 
     def state_dict(self) -> dict[str, Any]:
-        """The time and the curve so far, so that a resumed run goes on with both."""
+        """Return the time and the curve so far, so that a resumed run goes on with both."""
         return {"seconds": self.elapsed(), "rows": list(self._rows)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
