@@ -37,12 +37,12 @@ def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> Tensor:
 
 
 def element_pattern(grid: SphereGrid, exponent: float) -> Tensor:
-    """Amplitude (H, W) float64 of an element: cos^exponent of the angle off boresight, 0 behind it."""
+    """Return an element's amplitude (H, W) float64: cos^exponent of the angle off boresight, 0 behind."""
     return grid.directions()[..., 2].clamp_min(0) ** exponent
 
 
 def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tensor | None = None) -> Tensor:
-    """`h = A z` (B, M): what the elements measure of complex amplitudes z (B, H, W) per steradian.
+    """Return `h = A z` (B, M): what the elements measure of complex amplitudes z (B, H, W) per steradian.
 
     Args:
         waves: arriving field per direction, complex.
@@ -118,13 +118,13 @@ class Lags:
     elements: int
 
     def basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
-        """B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag, real parts, imaginary parts."""
+        """Return B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag, real and imaginary parts."""
         phase = grid.directions().reshape(-1, 3) @ torch.from_numpy(self.difference[1:].T)
         phase = 2 * math.pi / wavelength * phase
         return torch.cat([torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1)
 
     def forms(self) -> Tensor:
-        """Symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`, v = (Re h, Im h)."""
+        """Return symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`, v = (Re h, Im h)."""
         m = self.elements
         real = self.real_pairs.T.reshape(-1, m, m)
         imag = self.imag_pairs.T.reshape(-1, m, m)

@@ -51,7 +51,7 @@ class SpectrumRenderer(nn.Module):
             self.register_buffer(f"waves{number}", waves.float().contiguous())
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """Spectra (B, H, W) of (B, M + 1) complex64: array vectors and last the share f; differentiable."""
+        """Render spectra (B, H, W) of (B, M + 1) complex64: array vectors and last the share f."""
         parts = self._parts(vectors)
         square = torch.cat([parts[0] + parts[1], parts[0] - parts[1]], 2) if self.half_turn else parts[0]
         share = vectors[:, -1].real.square()[:, None, None]

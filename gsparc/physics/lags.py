@@ -60,12 +60,12 @@ class Lags:
         return self.pixels.image
 
     def atoms(self, directions: Tensor) -> Tensor:
-        """Lags (..., count) float32 of plane waves of unit power from unit vectors (..., 3)."""
+        """Return lags (..., count) float32 of plane waves of unit power from unit vectors (..., 3)."""
         angle = directions @ self._differences
         return torch.cat([self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1)
 
     def of(self, power: Tensor) -> Tensor:
-        """Lags (n, count) of spectra (n, H, W) in power, by least squares."""
+        """Return lags (n, count) of spectra (n, H, W) in power, by least squares."""
         return (self.pixels.of(power).double() @ self._inverse).float()
 
     def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:

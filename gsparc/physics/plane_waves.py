@@ -68,7 +68,7 @@ class Columns:
 
     @staticmethod
     def of(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
-        """Of sources (B, N, 2) and (B, N)."""
+        """Return columns of sources with direction cosines (B, N, 2) and delays (B, N)."""
         over_antennas = steering(direction, aperture)[:, None]
         over_tones = delays(delay, aperture)[:, None]
         by_cosine = over_antennas * aperture.cosine_slope
@@ -76,7 +76,7 @@ class Columns:
         return Columns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
 
     def gram(self) -> Tensor:
-        """Inner products (B, 4 N, 4 N) of all columns."""
+        """Return inner products (B, 4 N, 4 N) of all columns."""
         n = self.antennas.shape[2]
         over_antennas, over_tones = (flat.conj() @ flat.mT for flat in self._flat())
         for side in (1, 2):  # columns are (atom, slope by x, by y, by delay)
@@ -86,7 +86,7 @@ class Columns:
         return over_antennas * over_tones
 
     def inner(self, snapshot: Tensor) -> Tensor:
-        """Inner products (B, 4 N) of all columns with snapshots (B, A, K)."""
+        """Return inner products (B, 4 N) of all columns with snapshots (B, A, K)."""
         n, (antennas, tones) = self.antennas.shape[2], self._flat()
         correlation = antennas.conj() @ snapshot
         by_cosine = (correlation.unflatten(1, (3, n)) * tones[:, None, :n].conj()).sum(-1)
@@ -97,7 +97,7 @@ class Columns:
         return self.antennas.flatten(1, 2), self.tones.flatten(1, 2)
 
     def response(self, gain: Tensor) -> Tensor:
-        """Channels (B, A, K) of the atoms with gains (B, N)."""
+        """Return channels (B, A, K) of the atoms with gains (B, N)."""
         return (self.antennas[:, 0] * gain[..., None]).transpose(1, 2) @ self.tones[:, 0]
 
 
@@ -111,12 +111,12 @@ def phasor(turns: Tensor) -> Tensor:
 
 
 def steering(direction: Tensor, aperture: Aperture) -> Tensor:
-    """(B, N, A) complex."""
+    """Return responses (B, N, A) complex of the antennas to direction cosines (B, N, 2)."""
     return phasor(direction @ aperture.places.T)
 
 
 def delays(delay: Tensor, aperture: Aperture) -> Tensor:
-    """(B, N, K) complex."""
+    """Return responses (B, N, K) complex of the tones to delays (B, N) [turns per tone]."""
     return phasor(-delay[..., None] * aperture.tones)
 
 

@@ -19,7 +19,7 @@ AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
 def words(freedom: Freedom) -> str:
-    """For messages: `a phase and a delay`.
+    """Say in words what is free, for messages: `a phase and a delay`.
 
     >>> words("phase+delay+gain")
     'a phase, a delay and a gain'

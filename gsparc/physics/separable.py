@@ -40,7 +40,7 @@ class Separable:
         return self.rows @ (coefficients.unflatten(1, (-1, len(self.columns))) @ self.columns)
 
     def thinned(self, stride: int) -> Separable:
-        """Of every `stride`-th pixel; coefficients stay, `of` means nothing then."""
+        """Return the basis of every `stride`-th pixel; coefficients stay, `of` means nothing then."""
         return Separable(self.rows[::stride].contiguous(), self.columns[:, ::stride].contiguous())
 
 

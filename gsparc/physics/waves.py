@@ -59,7 +59,7 @@ def wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = to
 
 
 def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The same at every one of F frequencies: (...) [m], (F,) [Hz] -> (..., F).
+    """Return the same at every one of F frequencies: (...) [m], (F,) [Hz] -> (..., F).
 
     Evenly spaced tones are factored into a coarse and a fine comb, `f = f_0 + (q M + p) df`: about
     2 sqrt(F) sines and cosines instead of F, and one product per tone; 1/r enters with the coarse comb.
