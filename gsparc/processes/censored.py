@@ -60,7 +60,7 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
 def propagate(
     known: ConditionalGaussian, level: Tensor, side: Tensor | float = 1.0, start: Sites | None = None
 ) -> Sites:
-    """Stand-ins for "below `level`" (m,), or "above" where `side` is -1, of a vector's unknown entries.
+    """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
     Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same.
     """
@@ -114,7 +114,7 @@ class ConditionalGaussian:
 
     @classmethod
     def of(cls, gram: Tensor, values: Tensor, unknown: Tensor) -> ConditionalGaussian:
-        """Of a vector of mean zero.
+        """Condition a vector of mean zero on its known entries.
 
         Args:
             gram: (n, n) covariance with noise.
@@ -130,11 +130,11 @@ class ConditionalGaussian:
         return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
 
     def doubt(self, level: Tensor) -> Tensor:
-        """Deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
+        """Return deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
         return (level - self.mean) / self.covariance.diagonal().sqrt()
 
     def at(self, rows: Tensor) -> ConditionalGaussian:
-        """The entries `rows` alone."""
+        """Return the entries `rows` alone."""
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 

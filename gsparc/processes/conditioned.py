@@ -41,7 +41,7 @@ class Conditioned:
     def of(
         cls, covariance: Tensor, values: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend"
     ) -> Conditioned:
-        """Of a covariance (n, n), noise included, and values (n, R); see `Factor.of`."""
+        """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.of`."""
         factor = Factor.of(covariance, failing)
         return cls(factor, values, factor.solved(values))
 
@@ -65,27 +65,27 @@ class Conditioned:
         return inverse.addmm(weights, weights.mH, beta=weights.shape[1], alpha=-1)
 
     def mean(self, cross: Tensor) -> Tensor:
-        """(m, R) where covariances with the rows are (m, n)."""
+        """Return the mean (m, R) at places whose covariances with the rows are (m, n)."""
         return weighted(cross, self.weights)
 
     def known(self, cross: Tensor) -> Tensor:
-        """What the rows take from the variance (m,) of places of covariances (m, n) with them."""
+        """Return what the rows take from the variance (m,) of places of covariances (m, n) with them."""
         return self.factor.whitened(cross.mH).abs().square().sum(0)
 
     def left_out(self, groups: Iterable[Tensor] | None = None) -> tuple[Tensor, Tensor]:
-        """Residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
+        """Return residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
         inverse = self.factor.precision if groups is None else self.factor.inverse
         return left_out(inverse, self.weights, groups)
 
     def left_out_signal(
         self, disturbance: Tensor, groups: Iterable[Tensor] | None = None
     ) -> tuple[Tensor, Tensor | None]:
-        """The same of the signal alone; see `gsparc.processes.left_out.left_out_signal`."""
+        """Return the same of the signal alone; see `gsparc.processes.left_out.left_out_signal`."""
         return left_out_signal(self.factor.inverse, self.weights, disturbance, groups)
 
 
 def weighted(cross: Tensor, weights: Tensor) -> Tensor:
-    """`cross @ weights` (..., m, R), where covariances (..., m, n) may be real and weights complex."""
+    """Return `cross @ weights` (..., m, R); covariances (..., m, n) may be real and weights complex."""
     if weights.is_complex() and not cross.is_complex():
         return as_pairs(lambda pairs: cross @ pairs, weights)
     return cross @ weights

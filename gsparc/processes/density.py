@@ -34,7 +34,7 @@ class LeftOutDensity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, gram: Tensor, values: Tensor, entries: int, bounded: bool) -> tuple[Tensor, Tensor]:
-        """Of values (n, P) with a covariance `gram` (n, n) with noise, relative to the amplitude.
+        """Score values (n, P) with a covariance `gram` (n, n) with noise, relative to the amplitude.
 
         Args:
             ctx: of autograd.
@@ -64,7 +64,7 @@ class LeftOutDensity(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        """dK^-1 = -K^-1 dK K^-1: the slopes by R = K^-1 Y and by diag(K^-1) become one by K."""
+        """Turn slopes by R = K^-1 Y and by diag(K^-1) into one by K: dK^-1 = -K^-1 dK K^-1."""
         inverse, ratio, by_ratio = ctx.saved_tensors
         # These slopes are never positive: with their roots on both sides the product is symmetric.
         scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
@@ -88,7 +88,7 @@ class Evidence(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        """By the covariance, and by values and levels."""
+        """Return slopes by the covariance, and by values and levels."""
         slope, weights = ctx.saved_tensors
         return -slopes[0] * slope, slopes[0] * weights, None, None
 
@@ -98,7 +98,7 @@ class Profiled(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, gram: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Of values (n, P) with a covariance (n, n) relative to the amplitude [nats per number]."""
+        """Score values (n, P) with a covariance (n, n) relative to the amplitude [nats per number]."""
         factor = Factor.of(gram.detach(), "raise")
         weights, (count, outputs) = factor.solved(values), values.shape
         amplitude = (values * weights).mean().clamp_min(TINY)
@@ -110,7 +110,7 @@ class Profiled(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        """By the covariance."""
+        """Return the slope by the covariance."""
         return slopes[0] * ctx.saved_tensors[0], None
 
 
@@ -178,7 +178,7 @@ def by_left_out(
     bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
     entries: int = 1, bounded: bool = True,
 ) -> tuple[float, Kernel]:  # fmt: skip
-    """Least negative density of rows left out [nats per output], and its kernel; see `LeftOutDensity`."""
+    """Find the least negative density of rows left out [nats per output], and its kernel."""
 
     def objective(at: Tensor) -> Tensor:
         gram = gram_of(at, distance, columns)
@@ -195,7 +195,7 @@ def by_evidence(
     start: Kernel, distance: Tensor, values: Tensor, bounds: Sequence[tuple[float, float]], looks: int,
     tolerance: float,
 ) -> Kernel:  # fmt: skip
-    """The kernel of largest evidence for values (n, P) of mean 0, its amplitude too, from `start` on.
+    """Return the kernel of largest evidence for values (n, P) of mean 0, its amplitude too, from `start` on.
 
     Rasmussen and Williams 2006, eq. 5.8; distances (n, n) [m] of the places, bounds of `Kernel.parameters()`.
     """

@@ -56,7 +56,7 @@ class Factor:
 
     @classmethod
     def of(cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend") -> Factor:
-        """Of a Hermitian covariance (..., n, n); in float64 and with a ridge where it has no factor without.
+        """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
 
         Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is
         positive definite on paper and, rounded, has eigenvalues of either sign up to `ROUNDING trace(K)`. A
@@ -104,7 +104,7 @@ class Factor:
         return self._triangular(values, adjoint=False)
 
     def whitened_rounded(self, values: Tensor) -> Tensor:
-        """The same of values (n, R) by a stored inverse in float32: half the memory to read for few columns.
+        """Whiten (n, R) by a stored inverse in float32: half the memory to read for few columns.
 
         Rounding moves its squares by 1e-6 where the noise is a hundredth of the signal's variance.
         """
@@ -170,7 +170,7 @@ class Factor:
 
 
 def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
-    """Complex values (..., n, R) through a real factor, as twice as many real ones."""
+    """Solve for complex values (..., n, R) through a real factor, as twice as many real ones."""
     pairs = torch.view_as_real(values.resolve_conj()).flatten(-2)
     return torch.view_as_complex(solve(pairs).unflatten(-1, (-1, 2)).contiguous())
 

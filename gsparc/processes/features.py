@@ -41,7 +41,7 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
 
 
 def parts_of(length: float, name: Correlation) -> tuple[float, float, float, float]:
-    """Share and length [m] of its Matern-5/2, share and length of its Matern-3/2."""
+    """Return share and length [m] of a correlation's Matern-5/2, share and length of its Matern-3/2."""
     if name == "matern32":
         return 0.0, length, 1.0, length
     return 1 - ROUGH_SHARE, length, ROUGH_SHARE, ROUGH_RATIO * length
@@ -87,7 +87,7 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
 
 
 def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Whitened:
-    """Features at given places (E, 3) that stand for all rows (n, 3); see `whitened`."""
+    """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened`."""
     own = correlation(places, places, length, name)
     own.diagonal().add_(JITTER)
     factor = Factor.of(own)

@@ -49,7 +49,7 @@ def matern32(distance: Tensor, length: Tensor | float) -> Tensor:
 
 
 def matern32_of_squares(squared: Tensor) -> Tensor:
-    """Matern-3/2 of squared distances (...) in units of the length, with a slope where they are 0."""
+    """Return the Matern-3/2 of squared distances (...) in units of the length, with a slope at 0."""
     # What is added keeps the slope of the root finite where two places are one.
     root = (3 * squared + 1e-9).sqrt()
     return (1 + root) * torch.exp(-root)
@@ -81,7 +81,7 @@ def matern_sum(
 
 
 def smooth_rough(distance: Tensor, length: float) -> Tensor:
-    """A smooth long part, Matern-5/2 of `length`, and a rough short one, Matern-3/2 of a third of it."""
+    """Return a smooth long part, Matern-5/2, and a rough short one, Matern-3/2 of a third of `length`."""
     return torch.lerp(matern52(distance, length), matern32(distance, ROUGH_RATIO * length), ROUGH_SHARE)
 
 
@@ -109,11 +109,11 @@ class Kernel:
 
     @classmethod
     def of_one(cls, length: float, noise: float, amplitude: float = 1.0) -> Self:
-        """With one length [m]."""
+        """Return a kernel with one length [m]."""
         return cls((length,), (1.0,), noise, amplitude)
 
     def correlation(self, distance: Tensor) -> Tensor:
-        """Of distances (...) [m]."""
+        """Return correlations at distances (...) [m]."""
         return matern_sum(distance, self.lengths, self.shares)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
@@ -132,14 +132,14 @@ class Kernel:
         return self.lengths[0]
 
     def state(self) -> dict[str, list[float]]:
-        """Numbers that `read` needs."""
+        """Return numbers that `read` needs."""
         return {
             "lengths": [*self.lengths], "shares": [*self.shares], "kernel": [self.noise, self.amplitude]
         }  # fmt: skip
 
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
-        """The kernel whose `state()` this was."""
+        """Return the kernel whose `state()` this was."""
         lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
         return cls(lengths, shares, *(float(v) for v in state["kernel"]))
 
@@ -150,7 +150,7 @@ class Kernel:
 
     @classmethod
     def of(cls, parameters: np.ndarray, amplitude: float = 1.0) -> Self:
-        """The kernel whose `parameters()` these are."""
+        """Return the kernel whose `parameters()` these are."""
         lengths, shares, noise = unpacked(torch.from_numpy(np.asarray(parameters, np.float64)))
         return cls(tuple(map(float, lengths)), tuple(map(float, shares)), float(noise), amplitude)
 
@@ -179,7 +179,7 @@ class WaveKernel:
     amplitude: float = 1.0
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Correlations (..., n, m) of places (..., n, 3) and (..., m, 3) of one end, or 6 of both [m]."""
+        """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
         ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
         # `torch.sinc` has pi in its argument: sin(pi x) / (pi x).
         waves = [
@@ -188,12 +188,12 @@ class WaveKernel:
         return waves[0] if len(waves) == 1 else waves[0] * waves[1]
 
     def state(self) -> dict[str, list[float]]:
-        """Numbers that `read` needs."""
+        """Return numbers that `read` needs."""
         return {"wave": [self.wavenumber, float(self.length), self.noise, self.amplitude]}
 
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
-        """The kernel whose `state()` this was."""
+        """Return the kernel whose `state()` this was."""
         return cls(*(float(v) for v in state["wave"]))
 
 
@@ -201,12 +201,12 @@ class SmoothRough(Kernel):
     """The same with one `smooth_rough` part, of array vectors and emissions."""
 
     def correlation(self, distance: Tensor) -> Tensor:
-        """Of distances (...) [m]."""
+        """Return correlations at distances (...) [m]."""
         return smooth_rough(distance, self.lengths[0])
 
 
 def unpacked(parameters: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
-    """Lengths, shares and noise of `Kernel.parameters()` (2,) or (4,), differentiable."""
+    """Return lengths, shares and noise of `Kernel.parameters()` (2,) or (4,), differentiable."""
     if len(parameters) == 2:
         return [parameters[0].exp()], [torch.ones_like(parameters[0])], parameters[1].exp()
     # Of a logit both shares lie between 0 and 1, whatever a step does.

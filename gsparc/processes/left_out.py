@@ -43,13 +43,13 @@ def left_out(
 
 
 def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (s, R) of rows (s,) left out together, and their covariance (s, s); see `left_out`."""
+    """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s); see `left_out`."""
     block = Factor.of(inverse[rows[:, None], rows])
     return block.solved(weights[rows]), block.inverse
 
 
 def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (c, R) of rows (c,), each left out with what is `near` it (c, n) bool, and variances (c,).
+    """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances.
 
     Small systems of many sizes, solved as batches of the largest with units where a group has ended.
     """
@@ -75,7 +75,7 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
 def left_out_signal(
     inverse: Tensor, weights: Tensor, disturbance: Tensor, groups: Iterable[Tensor] | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """What the signal of all other rows misses of each (n, R), and its variance (n,) without groups.
+    """Return what the signal of all other rows misses of each (n, R), and its variance (n,) without groups.
 
     With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r` with the
     residual r of `left_out`: what disturbs others by their order alone is not predicted.

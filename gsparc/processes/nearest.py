@@ -42,7 +42,7 @@ TINY = 1e-30  # an amplitude has a logarithm
 
 
 def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
+    """Return weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
 
     Args:
         gram: (B, k, k) covariances of the near values, with their noise.
@@ -55,7 +55,7 @@ def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
 def weights_of(
     kernel: Kernel | WaveKernel, places: Tensor, near: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same of places (B, D) float64 [m], with autograd, by near rows (B, k, D) of `noise` (B, k)."""
+    """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D) of `noise` (B, k)."""
     gram = kernel.between(near, near)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
     return solved(gram, kernel.between(places[:, None], near)[:, 0])
@@ -81,7 +81,7 @@ class Values:
 
     @classmethod
     def of(cls, places: np.ndarray, values: Tensor) -> Values:
-        """Of rows (n, D), (n, P)."""
+        """Average rows at (n, D) with values (n, P) over each place."""
         unique, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
         counted = torch.from_numpy(count).to(values.dtype)
         sums = values.new_zeros(len(unique), values.shape[1]).index_add_(
@@ -201,7 +201,7 @@ class Nearest(Posterior):
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Nearest:
-        """The posterior whose `state()` this was."""
+        """Return the posterior whose `state()` this was."""
         near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
         rest, noise, terms, spread = (state[name] for name in ("rest", "noise", "terms", "spread"))
         return cls(Prior.read(state), near, rest, noise, terms, spread, int(state["most"]))
@@ -255,7 +255,7 @@ def given(
 def weighed(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Posterior mean (Q, P) and covariance (Q, Q) of the mean law's terms, the prior's being the unit matrix.
+    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
 
     Rows in random order condition on their nearest ones in the half before them: what is left of them is
     white, and of the terms too.
@@ -312,7 +312,7 @@ class Sample:
 
     @classmethod
     def of(cls, places: Tensor, values: Tensor, counts: Tensor) -> Sample:
-        """Of (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
+        """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
         between = apart(places, places)
         return cls(
             between[:, 0, 1:], between[:, 1:, 1:], values[:, 0], values[:, 1:], counts[:, 0], counts[:, 1:]
@@ -320,7 +320,7 @@ class Sample:
 
 
 def density_given_nearest(parameters: Tensor, sample: Sample) -> tuple[Tensor, Tensor]:
-    """Negative log density, mean over rows [nats], and the best amplitude, at `Kernel.parameters()`."""
+    """Return the negative log density, mean over rows [nats], and the best amplitude."""
     lengths, shares, noise = unpacked(parameters)
     gram = matern_sum(sample.apart, lengths, shares) + torch.diag_embed(noise / sample.counts + JITTER)
     weights, known = solved(gram, matern_sum(sample.far, lengths, shares))
@@ -334,7 +334,7 @@ def density_given_nearest(parameters: Tensor, sample: Sample) -> tuple[Tensor, T
 
 
 def most_likely(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> Kernel:
-    """The kernel of largest density of rows given their neighbours, walked to from the best of `starts`.
+    """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
 
     Args:
         starts: all of one number of lengths.
@@ -350,7 +350,7 @@ def most_likely(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> K
 
 
 def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
-    """The kernel most likely by rows that cover the site, given their neighbours, and what is to be said.
+    """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
     Neighbours are looked for among all places, among an eighth of them, and so on: what is near shows the
     short length, what is sparse the long one.

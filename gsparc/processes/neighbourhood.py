@@ -76,7 +76,7 @@ class Neighbourhood:
 
     @classmethod
     def of(cls, places: np.ndarray, seed: int) -> Neighbourhood:
-        """Sets of an eighth of the places, of an eighth of these, and so on."""
+        """Draw sets of an eighth of the places, of an eighth of these, and so on."""
         rows, sets = np.arange(len(places)), []
         while len(rows) / SPARSER >= FEWEST:
             rows = rows[covering(places[rows], int(len(rows) / SPARSER), seed)]
@@ -98,7 +98,7 @@ class Neighbourhood:
         return cKDTree(self.places)
 
     def shares(self, most: int) -> list[tuple[np.ndarray, int]]:
-        """Rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
+        """Return rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
         sparser = len(self._trees) - 1
         share = int(most * WIDER) // max(sparser, 1)
         # The densest set has what the sparser ones leave, rounding included.
@@ -108,7 +108,7 @@ class Neighbourhood:
     def nearest(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
     ) -> np.ndarray:
-        """Numbers (B, k) of neighbours of queries (B, D).
+        """Return numbers (B, k) of neighbours of queries (B, D).
 
         Args:
             queries: [m].
@@ -130,7 +130,7 @@ class Neighbourhood:
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
-    """From queries (B, D) float64 to the nearest of a tree's places (B,) [m], with autograd."""
+    """Return distances (B,) [m] from queries (B, D) float64 to a tree's nearest place, with autograd."""
     distance, row = tree.query(numbers(queries))
     if not followed(queries):
         return torch.from_numpy(distance)

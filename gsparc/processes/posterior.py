@@ -56,7 +56,7 @@ class Exact(Posterior):
         extra: Tensor | None = None,
         factor: Factor | None = None,
     ) -> Exact:
-        """Of values (n, P) at places (n, D) float64 [m]; their covariance's factor where it is known."""
+        """Condition on values (n, P) at places (n, D) float64 [m]; with their factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
         result = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
@@ -108,7 +108,7 @@ class Exact(Posterior):
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def cross(self, queries: Tensor, own: Tensor) -> Tensor:
-        """Covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
+        """Return covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
         result = self.prior.kernel.between(queries, self.rows)
         return result if self.prior.trend is None else result.addmm(own, self._columns.T)
 
@@ -117,7 +117,7 @@ class Exact(Posterior):
         return self.prior.columns(self.rows)
 
     def values(self) -> Tensor:
-        """What it was given (n, P)."""
+        """Return the values that it was given (n, P)."""
         lower = self.factor.lower
         return self.prior.mean(self.rows) + weighted(lower, weighted(lower.T, self.weights))
 
@@ -127,12 +127,12 @@ class Exact(Posterior):
         return self.values() - residual, variance
 
     def residual(self) -> tuple[Tensor, Tensor]:
-        """What all other rows miss of each (n, P), and its variance (n,)."""
+        """Return what all other rows miss of each (n, P), and its variance (n,)."""
         return left_out(self.factor.precision, self.weights)
 
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
-        """(B, B) of the signal at places (B, D), in the kernel's units."""
+        """Return the covariance (B, B) of the signal at places (B, D), in the kernel's units."""
         cross = self.cross(queries, self.prior.columns(queries))
         white = self.factor.whitened(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
@@ -143,7 +143,7 @@ class Exact(Posterior):
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Exact:
-        """The posterior whose `state()` this was."""
+        """Return the posterior whose `state()` this was."""
         return cls(Prior.read(state), state["places"], state["weights"], state["extra"])
 
 
@@ -154,6 +154,6 @@ def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
 
 
 def approximated(name: str, posterior: Posterior | None) -> str:
-    """A method's name with how its process is approximated, where it is."""
+    """Return a method's name with how its process is approximated, where it is."""
     how = None if posterior is None else posterior.approximation
     return name if how is None else f"{name} ({how})"

@@ -51,7 +51,7 @@ class Rows:
         return self.side != 0
 
     def at(self, chosen: np.ndarray) -> Self:
-        """The rows `chosen`."""
+        """Return the rows `chosen`."""
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     @property
@@ -60,7 +60,7 @@ class Rows:
         return self.at(np.flatnonzero(~self.silent))
 
     def drawn(self, most: int, seed: int) -> Self:
-        """At most so many, in their order; at least half of them were heard where as many were."""
+        """Draw at most so many, in their order; at least half of them were heard where as many were."""
         return self.at(draw(self.silent, most, seed))
 
 
@@ -80,7 +80,7 @@ def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
 
 
 def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
-    """About a law; about the mean of what was heard where that is None."""
+    """Return a trend about a law; about the mean of what was heard where that is None."""
     if law is not None:
         return Trend.about(law, torch.from_numpy(rows.places))
     return Trend(float((rows if rows.silent.all() else rows.loud).decibels.mean()))
@@ -125,7 +125,7 @@ class PowerProcess:
         return self.posterior.places.numpy()
 
     def answer(self, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean [dB], variance of a measurement [dB^2], and what is unknown, in [0, 1], each (B,).
+        """Return the mean [dB], variance of a measurement [dB^2], and what is unknown, in [0, 1], each (B,).
 
         Unknown is the variance as a share of that of the known rows. What the mean law explains of them
         counts as known near them only: its slope says nothing of places far from all data.
@@ -148,14 +148,14 @@ class PowerProcess:
         return max(self.posterior.extent * REACH, 1e-9)
 
     def mean_at(self, queries: Tensor) -> Tensor:
-        """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
+        """Return the mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
         return sum(
             (share * one.posterior.mean_at(queries)[:, 0] for share, one in self.members),
             queries.new_zeros(len(queries)),
         )
 
     def left_out(self, at: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Mean [dB] of each row that was heard without its own, and variance of a measurement [dB^2].
+        """Return mean [dB] and variance [dB^2] of a measurement at each heard row without its own.
 
         Args:
             at: (n,) places of the rows, where the nearest alone are looked at.
@@ -169,7 +169,7 @@ class PowerProcess:
         return averaged(parts)
 
     def exact(self) -> PowerProcess:
-        """The first alone, with covariances between places; of many rows, given some that cover the site."""
+        """Return the first alone, with covariances between places; of many rows, given some of them."""
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
             return replace(self, others=())
@@ -180,13 +180,13 @@ class PowerProcess:
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
 
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `read` needs."""
+        """Return tensors and numbers that `read` needs."""
         others = [{**one.state(), "share": share} for share, one in self.others]
         return {**self.posterior.state(), "heard": self.heard, **({"others": others} if others else {})}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> PowerProcess:
-        """The process whose `state()` this was."""
+        """Return the process whose `state()` this was."""
         kind = Nearest if "level" in state else Exact
         others = tuple((float(one["share"]), cls.read(one)) for one in state.get("others", ()))
         return cls(kind.read(state), float(state["heard"]), others)
@@ -208,7 +208,7 @@ def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Ten
 
 
 def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
-    """The process given all rows with settings as they are, and what must be said of the silent ones.
+    """Return the process given all rows with settings as they are, and what must be said of the silent ones.
 
     Args:
         rows: at least one.

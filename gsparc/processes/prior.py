@@ -28,29 +28,29 @@ class Prior:
     trend: Trend | None = None
 
     def mean(self, places: Tensor) -> Tensor:
-        """(n, 1) at places (n, D) [m]."""
+        """Return the mean (n, 1) at places (n, D) [m]."""
         return places.new_zeros(len(places), 1) if self.trend is None else self.trend.mean(places)[:, None]
 
     def columns(self, places: Tensor) -> Tensor:
-        """Terms (n, Q) at places (n, D) [m]."""
+        """Return terms (n, Q) at places (n, D) [m]."""
         return places.new_zeros(len(places), 0) if self.trend is None else self.trend.terms(places)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
+        """Return the covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
         result = self.kernel.between(a, b)
         return result if self.trend is None else result.addmm(self.columns(a), self.columns(b).T)
 
     def variance(self, columns: Tensor) -> Tensor:
-        """Of a measurement (n,) at places of terms (n, Q)."""
+        """Return the variance of a measurement (n,) at places of terms (n, Q)."""
         return columns.square().sum(1) + (1 + self.kernel.noise)
 
     def state(self) -> dict[str, Any]:
-        """Numbers that `read` needs."""
+        """Return numbers that `read` needs."""
         return {**self.kernel.state(), **({} if self.trend is None else self.trend.state())}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Prior:
-        """The prior whose `state()` this was."""
+        """Return the prior whose `state()` this was."""
         kinds: dict[str, Any] = {"wave": WaveKernel, "site_kernel": SectorKernel}  # the last as a kernel does
         kind = next((kinds[name] for name in kinds if name in state), Kernel)
         trend = trend_of(state) if "trend" in state else None
@@ -85,26 +85,26 @@ class Posterior(ABC):
 
     @abstractmethod
     def answer(self, queries: Tensor, exact: bool = False) -> Answer:
-        """Of places (B, D) float64 [m], with autograd; which rows are nearest has no gradient.
+        """Answer at places (B, D) float64 [m], with autograd; which rows are nearest has no gradient.
 
         Values of very many rows may be float32, and means with them; `exact`: they are made float64.
         """
 
     @abstractmethod
     def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
-        """The mean alone (B, P), as `answer` has it."""
+        """Return the mean alone (B, P), as `answer` has it."""
 
     @abstractmethod
     def left_out(self) -> tuple[Tensor, Tensor]:
-        """Mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
+        """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
 
     @abstractmethod
     def distance(self, queries: Tensor) -> Tensor:
-        """From places (B, D) to the nearest row (B,) [m]."""
+        """Return distances (B,) [m] from places (B, D) to the nearest row."""
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `read` needs."""
+        """Return tensors and numbers that `read` needs."""
 
     @cached_property
     def extent(self) -> float:

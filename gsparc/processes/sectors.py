@@ -59,7 +59,7 @@ class Sectors(Trend):
         return self.at(places, self.shared, self.levels)
 
     def at(self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None) -> Tensor:
-        """Powers (..., n) [dB] for shared parameters (..., 6), levels, azimuth, tilt and width (..., 3)."""
+        """Return powers (..., n) [dB] for shared parameters (..., 6), levels; turn, tilt, width (..., 3)."""
         assert self.law is not None
         number = places[:, 6].long()
         decades = self.law.decades(places) - self.middle
@@ -68,7 +68,7 @@ class Sectors(Trend):
         return level - bend * decades.square() - self.loss(places, shared, own)
 
     def loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
-        """What patterns take off (..., n) [dB]; see `at`."""
+        """Return what patterns take off (..., n) [dB]; see `at`."""
         azimuth, tilt, width, height, _ = self.table[places[:, 6].long()].T
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
@@ -86,7 +86,7 @@ class Sectors(Trend):
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
     def columns(self, places: Tensor) -> Tensor:
-        """(n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
+        """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         steps = STEP * torch.tensor(SHARED_SPREAD, dtype=torch.float64).diag()
         ends = self.at(places, self.shared + torch.cat([steps, -steps]), self.levels)
         # Central differences, half a spread to either side.
@@ -131,22 +131,22 @@ class SectorKernel:
     amplitude: float = 1.0
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Correlations (n, m) of places (n, 7) and (m, 7)."""
+        """Return correlations (n, m) of places (n, 7) and (m, 7)."""
         return self.of(Pairs.of(a, b), self.lengths, self.shares)
 
     @staticmethod
     def of(pairs: Pairs, lengths: Any, shares: Any) -> Tensor:
-        """The same of pairs, differentiable in lengths and shares."""
+        """Return the same of pairs, differentiable in lengths and shares."""
         own = shares[1] * matern32(pairs.distance, lengths[1]) + shares[2] * pairs.alike
         return shares[0] * matern32(pairs.distance, lengths[0]) + pairs.same * own
 
     def state(self) -> dict[str, Any]:
-        """Numbers that `read` needs."""
+        """Return numbers that `read` needs."""
         return {"site_kernel": [*self.lengths, *self.shares, self.noise, self.amplitude]}
 
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
-        """The kernel whose `state()` this was."""
+        """Return the kernel whose `state()` this was."""
         v = [float(value) for value in state["site_kernel"]]
         return cls((v[0], v[1]), (v[2], v[3], v[4]), v[5], v[6])
 
@@ -161,7 +161,7 @@ class Pairs:
 
     @classmethod
     def of(cls, a: Tensor, b: Tensor) -> Pairs:
-        """Of places (..., n, 7) and (..., m, 7)."""
+        """Compare places (..., n, 7) with (..., m, 7)."""
         towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
@@ -169,5 +169,5 @@ class Pairs:
 
 
 def with_sectors(trend: Trend, state: Mapping[str, Any]) -> Sectors:
-    """The trend whose `state()` had these sectors."""
+    """Return the trend whose `state()` had these sectors."""
     return replace(Sectors(**{name: getattr(trend, name) for name in vars(trend)}), **state)

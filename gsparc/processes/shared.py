@@ -39,7 +39,7 @@ class Block:
 
     @classmethod
     def of(cls, process: Exact, columns: Tensor) -> Block:
-        """With shared columns (n, P), in units of the values, at its rows."""
+        """Whiten a process with shared columns (n, P), in units of the values, at its rows."""
         deviation = deviation_of(process.prior)
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whitened(columns) / deviation, values)
@@ -90,14 +90,14 @@ class Shared:
         self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
 
     def block(self, number: int) -> Block:
-        """That of one process, factored when it is asked for."""
+        """Return the block of one process, factored when it is asked for."""
         if number not in self._blocks:
             process = self.processes[number]
             self._blocks[number] = Block.of(process, self.columns(process.rows))
         return self._blocks[number]
 
     def answer(self, queries: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of a measurement, each (B,).
+        """Return the mean and variance of a measurement, each (B,).
 
         Args:
             queries: (B, D) float64.
@@ -115,7 +115,7 @@ class Shared:
         return mean, left
 
     def together(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        """Means (B, k) and covariances (B, k, k) of measurements of one process, at (B, k, D) float64."""
+        """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         own = self.never.columns(flat)
         said = self._said(flat, number, own, self.columns(flat))
@@ -151,7 +151,7 @@ class Shared:
 
     @torch.no_grad()
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:
-        """Errors (n,) of a process's rows, each predicted from all others, and their variances (n,)."""
+        """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
         block = self.block(number)
         root = block.process.factor.root / deviation_of(block.process.prior)
         known = self.factor.whitened((root.T @ block.columns).T).square().sum(0)
@@ -160,12 +160,12 @@ class Shared:
 
 
 def deviation_of(prior: Prior) -> float:
-    """Of a process [units of its values]."""
+    """Return the deviation of a process [units of its values]."""
     return math.sqrt(prior.kernel.amplitude)
 
 
 def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
-    """Factor of the precision (P, P) of the shared weights, and their mean (P,)."""
+    """Return the factor of the precision (P, P) of the shared weights, and their mean (P,)."""
     size = blocks[0].columns.shape[1]
     # From the identity, the precision of unit normal weights before any row.
     precision = sum((block.gram for block in blocks), torch.eye(size, dtype=torch.float64))
@@ -175,7 +175,7 @@ def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
 
 
 def left_out_whole(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
-    """Of each process, errors (n,) of all its rows predicted from the other processes, and their variances.
+    """Return errors (n,) of each process's rows predicted from the other processes, and variances.
 
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
     """

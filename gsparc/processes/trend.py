@@ -40,23 +40,23 @@ class Law:
     place: tuple[float, float, float] | None
 
     def decades(self, places: Tensor) -> Tensor:
-        """log10 of the distance in metres, floored, (n,) at places (n, 3), or of both ends (n, 6) [m]."""
+        """Return log10 of the distance in metres, floored, (n,) at (n, 3), or of both ends (n, 6) [m]."""
         still = places[:, 3:6] if self.place is None else places.new_tensor(self.place)
         squared = (places[:, :3] - still).square().sum(1)
         # Half the logarithm of the square: the root, whose slope at 0 is infinite, is never taken.
         return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
 
     def mean(self, places: Tensor) -> Tensor:
-        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
+        """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
         return self.level - 10 * self.exponent * self.decades(places)
 
     def state(self) -> dict[str, list[float]]:
-        """Numbers that `law_of_state` needs."""
+        """Return numbers that `law_of_state` needs."""
         return {"law": [*astuple(self)[:4]], "law_place": [*(self.place or ())]}
 
 
 def law_of_state(state: dict[str, Any]) -> Law | None:
-    """The law whose `state()` this was; None of none."""
+    """Return the law whose `state()` this was; None of none."""
     values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
     at = (place[0], place[1], place[2]) if place else None
     return Law(values[0], values[1], values[2], values[3], at) if values else None
@@ -86,7 +86,7 @@ class Walls:
     still: Tensor
 
     def crossed(self, places: Tensor) -> Tensor:
-        """How many walls and floors (n, 2) lie on paths to places (n, 3), or between both ends (n, 6) [m]."""
+        """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6) [m]."""
         other = self.still.expand(len(places), 3) if len(self.still) else places[:, 3:]
         start, end = (
             (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
@@ -124,16 +124,16 @@ class Trend:
 
     @classmethod
     def about(cls, law: Law, places: Tensor) -> Trend:
-        """About a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
+        """Return a trend about a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
         decades = law.decades(places)
         return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD))
 
     def mean(self, places: Tensor) -> Tensor:
-        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
+        """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
         return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
 
     def terms(self, places: Tensor) -> Tensor:
-        """What is uncertain of the mean (n, P): a constant, a law's slope, losses in walls and floors."""
+        """Return what is uncertain of the mean (n, P): constant, slope, losses in walls and floors."""
         parts = [torch.ones_like(places[:, :1])]
         if self.law is not None:
             # Centred, so that slope and level are nearly independent.
@@ -141,14 +141,14 @@ class Trend:
         return torch.cat(parts if self.walls is None else [*parts, self.walls.crossed(places)], 1)
 
     def state(self) -> dict[str, Any]:
-        """Numbers that `trend_of` needs."""
+        """Return numbers that `trend_of` needs."""
         law = {"law": [], "law_place": []} if self.law is None else self.law.state()
         walls = {} if self.walls is None else {"walls": vars(self.walls)}
         return {"trend": [self.level, self.middle, self.spread], **law, **walls}
 
 
 def trend_of(state: dict[str, Any]) -> Trend:
-    """The trend whose `state()` this was."""
+    """Return the trend whose `state()` this was."""
     level, middle, spread = (float(v) for v in state["trend"])
     walls = Walls(**state["walls"]) if "walls" in state else None
     return Trend(level, law_of_state(state), middle, spread, walls)

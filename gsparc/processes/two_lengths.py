@@ -33,7 +33,7 @@ def first_kernel(length: float) -> Kernel:
 
 
 def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
-    """The kernel of largest evidence near `start`.
+    """Return the kernel of largest evidence near `start`.
 
     Args:
         places: (n, D) [m].

@@ -25,7 +25,7 @@ def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
 
 
 def cancelled_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Within, `raise_if_cancelled` does so as soon as `unwanted`, or who surrounds it, says so."""
+    """Make `raise_if_cancelled` raise, within, as soon as `unwanted`, or who surrounds it, says so."""
     return _within("unwanted", unwanted)
 
 
@@ -38,7 +38,7 @@ def raise_if_cancelled() -> None:
 
 
 def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Within, `late` says what `over`, or who surrounds it, says, in this thread.
+    """Make `late` say, within, what `over`, or who surrounds it, says, in this thread.
 
     >>> with late_when(lambda: True):
     ...     late()
@@ -50,18 +50,18 @@ def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
 
 
 def after(most: int) -> Callable[[], bool]:
-    """Says whether this thread has made `most` further factors and blocks of candidates."""
+    """Return a call: whether this thread has made `most` further factors and blocks of candidates."""
     end = getattr(_asked, "steps", 0) + most
     return lambda: getattr(_asked, "steps", 0) >= end
 
 
 def late() -> bool:
-    """Whether this thread's time is over: a loop of more than a second then ends with what it has."""
+    """Tell whether this thread's time is over: a loop of more than a second then ends with what it has."""
     over = getattr(_asked, "over", None)
     return over is not None and over()
 
 
 def stop_when_late(*unused: object) -> None:
-    """The callback of `scipy.optimize.minimize`: no step follows when it is late."""
+    """Return the callback of `scipy.optimize.minimize`: no step follows when it is late."""
     if late():
         raise StopIteration
