@@ -48,7 +48,7 @@ class Offsets:
 
 
 def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
-    """Nine blocks, a base station in the middle street, `scatterers` lamp posts and parked cars."""
+    """Build nine blocks, a base station in the middle street, `scatterers` lamp posts and parked cars."""
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
@@ -92,7 +92,7 @@ class World:
     noise_power: float
 
     def response(self, frequency_hz: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """True channels (S, 64, K) complex64 at absolute frequencies (K,) [Hz]; some `rows` only."""
+        """Return true channels (S, 64, K) complex64 at absolute frequencies (K,) [Hz]; some `rows` only."""
         rows = np.arange(len(self.users)) if rows is None else rows
         parts = []
         for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
@@ -102,7 +102,7 @@ class World:
 
 
 def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
-    """`count` users whose packets the base station decodes, in streets open to it and blocked from it.
+    """Draw `count` users whose packets the base station decodes, in open and in blocked streets.
 
     Raises:
         ValueError: fewer than `count` users are decoded.
@@ -121,7 +121,7 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
 
 
 def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
-    """Measured channels (S, 64, 52) complex64: truth, offsets, noise."""
+    """Draw measured channels (S, 64, 52) complex64: truth, offsets, noise."""
     rng = np.random.default_rng([seed, 3])
     count = len(truth.users)
     clean = truth.response(CARRIER_HZ + TONES * SPACING_HZ)

@@ -45,7 +45,7 @@ class Assembled:
 
 
 def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
-    """What a shard keeps of some receivers."""
+    """Return what a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
     images, peak = spectra(paths, campaign.spectrum, frequency, wavelength)
     strongest = np.zeros(len(paths))

@@ -43,7 +43,7 @@ class Deliverable:
 
     @staticmethod
     def parse(text: str, quantile: float = 0.95) -> Deliverable:
-        """From text: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
+        """Read text: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
 
         Raises:
             ValueError: none of these.
@@ -130,7 +130,7 @@ class Probe:
         return self.paths.received_power() > 0
 
     def shares(self, remaining: PropagationEffects | Paths) -> np.ndarray:
-        """Share of each receiver's power that is lost (R,), negative where more arrives.
+        """Return the share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
             remaining: effects, here and below; or another trace of these receivers, of fewer rays.
@@ -144,7 +144,7 @@ class Probe:
         return 1 - rest / np.where(full > 0, full, 1)
 
     def nmse(self, remaining: PropagationEffects | Paths) -> np.ndarray:
-        """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
+        """Return the NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full = self._channels.sum(0)
         if isinstance(remaining, Paths):
             rest = self._responses(remaining)
@@ -158,7 +158,7 @@ class Probe:
         return error / np.where(energy > 0, energy, 1)
 
     def errors(self, remaining: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
-        """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
+        """Return the deliverable's error at each receiver (R,), in the unit of its tolerance."""
         least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
             return np.abs(10 * np.log10(np.maximum(1 - self.shares(remaining), least)))
@@ -190,7 +190,7 @@ def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
 
 
 def combinations(full: PropagationEffects, removable: tuple[str, ...]) -> list[PropagationEffects]:
-    """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
+    """List every set of switches without some of `removable` (named as in `removals`); `full` first."""
     sets = {full}
     for name in removable:
         sets |= {less for less in (_without(one, name) for one in sets) if less is not None}
@@ -210,7 +210,7 @@ def _without(effects: PropagationEffects, name: str) -> PropagationEffects | Non
 def reasons(
     probe: Probe, distances: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, str]:
-    """Why an effect should or should not matter, by its name; absent where there is no short one.
+    """Return why an effect should or should not matter, by its name; absent where there is no short one.
 
     Distances (R,) [m] are between the ends; of materials `permittivity`, `thickness_m` and `scattering` are
     read where given.

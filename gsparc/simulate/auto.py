@@ -65,7 +65,7 @@ class AutoSettings:
         return Deliverable.parse(self.deliverable, self.quantile)
 
     def allowed_failures(self, heard: int, last: bool) -> tuple[int, int]:
-        """`allowed_failures` where so many receivers are all, or those of the first look."""
+        """Call `allowed_failures` where so many receivers are all, or those of the first look."""
         first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
         return allowed_failures(first, all_, self.quantile, self.confidence)
 
@@ -157,7 +157,7 @@ class Choice:
 
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:
-        """Inverse of `dataclasses.asdict`."""
+        """Invert `dataclasses.asdict`."""
         verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
         table = tuple(EffectRow(**row) for row in stored["table"])
         return Choice(
@@ -171,7 +171,7 @@ class Choice:
 
 
 def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | None:
-    """The cheapest effects that meet the requirement; None where more probes are needed to say.
+    """Return the cheapest effects that meet the requirement; None where more probes are needed to say.
 
     Args:
         probe: receivers traced with everything: the first look's, or all probes.
@@ -211,13 +211,13 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
 
 
 def explained(choice: Choice, reasons: Mapping[str, str]) -> Choice:
-    """The choice with expectations from physics, by effect."""
+    """Return the choice with expectations from physics, by effect."""
     table = (replace(row, reason=reasons.get(row.effect.split(" > ")[0], "")) for row in choice.table)
     return replace(choice, table=tuple(table))
 
 
 def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
-    """The choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
+    """Return the choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
     if not len(errors):
         return choice
     met = float((errors <= settings.required.tolerance).mean())
@@ -228,7 +228,7 @@ def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice
 def fewer_rays(
     choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int, last: bool
 ) -> Choice | None:
-    """The choice with fewer rays, or without them; None where more probes are needed to say.
+    """Return the choice with fewer rays, or without them; None where more probes are needed to say.
 
     Args:
         choice, settings, probe, last: as of `decide`.
@@ -244,13 +244,13 @@ def fewer_rays(
 
 
 def everything(choice: Choice, full: PropagationEffects) -> Choice:
-    """All effects, in place of a choice that held-back receivers refute; the verdict is on the latter."""
+    """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
 
 
 def without_fewer_rays(choice: Choice) -> Choice:
-    """The choice, whose fewer rays the held-back receivers refute."""
+    """Return the choice, whose fewer rays the held-back receivers refute."""
     return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
 
 

@@ -47,13 +47,13 @@ class Material:
     conductivity: float
 
     def logarithms(self) -> np.ndarray:
-        """(2,) what is optimised."""
+        """Return what is optimised (2,)."""
         # A conductor's permittivity is 1, an insulator's conductivity 0: neither has a logarithm.
         return np.log([max(self.permittivity - 1, 1e-3), max(self.conductivity, 1e-6)])
 
     @staticmethod
     def of(logarithms: np.ndarray) -> Material:
-        """From (2,)."""
+        """Return the material of these logarithms (2,)."""
         return Material(1 + math.exp(logarithms[0]), math.exp(logarithms[1]))
 
 
@@ -78,7 +78,7 @@ class Calibration:
 
 
 def used_materials(tracer: RayTracer) -> dict[str, Material]:
-    """Materials of the scene's surfaces, as the tracer has them."""
+    """Return materials of the scene's surfaces, as the tracer has them."""
     return {
         name: Material(float(one.relative_permittivity[0]), float(one.conductivity[0]))
         for name, one in sorted(tracer.surfaces().items())
@@ -113,13 +113,13 @@ class Replay:
             first += count
 
     def powers(self) -> np.ndarray:
-        """(R,) sums of path powers under the scene's present materials; 0 where no path arrives."""
+        """Sum path powers (R,) under the scene's present materials; 0 where no path arrives."""
         return self._powers().numpy().astype(np.float64)
 
     def decibels(
         self, materials: Mapping[str, np.ndarray], slopes: Callable[[np.ndarray], tuple[float, np.ndarray]]
     ) -> tuple[float, np.ndarray]:
-        """A function of the powers in decibels, and its gradient by the materials.
+        """Evaluate a function of the powers in decibels, and its gradient by the materials.
 
         Args:
             materials: logarithms (2,) by name.
@@ -200,7 +200,7 @@ def _field_arguments(
 def calibrate(
     replay: Replay, start: Mapping[str, Material], traced: np.ndarray, measured_db: np.ndarray, steps: int
 ) -> Calibration:
-    """Materials, one gain and the residuals' scale of largest posterior.
+    """Find materials, one gain and the residuals' scale of largest posterior.
 
     Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
     materials (`gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that

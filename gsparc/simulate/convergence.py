@@ -36,14 +36,14 @@ class Convergence:
     receivers: int
 
     def attributes(self) -> dict[str, float | int]:
-        """For the file, beside `convergence_error`, which is `nmse`."""
+        """Return attributes for the file, beside `convergence_error`, which is `nmse`."""
         return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
 def convergence(
     campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards, left_out: np.ndarray
 ) -> Convergence | None:
-    """Rows of a file beside the same under a second seed; None where none is asked for, or without rays.
+    """Compare rows of a file with a second seed's; None where none is asked for, or without rays.
 
     Rows `left_out` (n,) were traced otherwise.
     """

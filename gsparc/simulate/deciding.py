@@ -67,14 +67,14 @@ class Decision:
         return (self.effects, self.samples) == (self.choice.effects, self.choice.samples)
 
     def note(self) -> dict[str, Any]:
-        """What a resumed run reads; without paths, which are in a shard."""
+        """Return what a resumed run reads; without paths, which are in a shard."""
         changed = None if self.changed is None else [v.tolist() for v in vars(self.changed).values()]
         about = {"choice": asdict(self.choice), "effects": asdict(self.effects)}
         return {**about, "samples": self.samples, "changed": changed}
 
     @staticmethod
     def of(note: Mapping[str, Any]) -> Decision:
-        """Inverse of `note`."""
+        """Invert `note`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
         effects = PropagationEffects(**note["effects"])
@@ -93,7 +93,7 @@ class Traced:
         self._costs: list[float] = []  # CPU seconds of each part
 
     def paths(self, rows: np.ndarray) -> Paths:
-        """Paths of rows (n,); those not traced before are."""
+        """Return paths of rows (n,), tracing those that were not traced before."""
         missing = np.setdiff1d(rows, self.rows)
         if len(missing):
             waiting = self._ahead[~np.isin(self._ahead, np.concatenate([self.rows, missing]))]
@@ -106,7 +106,7 @@ class Traced:
         return join(self._parts).take(at[np.searchsorted(self.rows[at], rows)])
 
     def timed(self, choice: Choice) -> Choice:
-        """The choice with CPU seconds of a row, and of compiling, which the first of several parts does."""
+        """Return the choice with CPU seconds of a row, and of compiling, which the first part does."""
         if len(self._parts) < 2:
             return replace(choice, row_all=None, compiling=None)
         first = len(self._parts[0])
@@ -117,7 +117,7 @@ class Traced:
 
 
 def busy_s() -> float:
-    """CPU seconds of this process, without the system's.
+    """Return CPU seconds of this process, without the system's.
 
     These are mostly of the first use of the solver's memory, which would pass for compiling.
     """
@@ -125,7 +125,7 @@ def busy_s() -> float:
 
 
 def pays(choice: Choice, rows: int, saved: float) -> bool:
-    """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects."""
+    """Tell whether a share of the time of so many rows pays for compiling the solver anew."""
     if choice.row_all is None or choice.compiling is None:
         return rows > 0
     return rows * choice.row_all * saved > choice.compiling

@@ -97,7 +97,7 @@ class PropagationEffects:
 
 
 def from_config(config: Mapping[str, Any]) -> PropagationEffects:
-    """Switches from the config group `effects`.
+    """Return switches from the config group `effects`.
 
     Raises:
         ValueError: a switch that does not exist, or a contradiction.

@@ -50,7 +50,7 @@ class SimulatorMissing(RuntimeError):
 
 
 def candidates() -> list[Path]:
-    """Libraries to try, best first: the one the user names (then no other), ours, the system's."""
+    """Return libraries to try, best first: the one the user names (then no other), ours, the system's."""
     if named := os.environ.get(VARIABLE):
         return [Path(named)]
     system = (p for folder in SYSTEM for p in sorted(Path("/usr/lib").glob(f"{folder}/libLLVM.so.*.1")))
@@ -59,7 +59,7 @@ def candidates() -> list[Path]:
 
 @lru_cache
 def fault(library: Path) -> str | None:
-    """What is wrong with a library, in words; None when a tiny solve works with it.
+    """Return what is wrong with a library, in words; None when a tiny solve works with it.
 
     The solve runs in a subprocess, because a wrong LLVM ends the process that loads it.
     """

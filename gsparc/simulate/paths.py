@@ -40,7 +40,7 @@ class Paths:
         receivers: int, owner: np.ndarray, gain: np.ndarray, delay: np.ndarray, direction: np.ndarray,
         mechanisms: np.ndarray, order: np.ndarray,
     ) -> Paths:  # fmt: skip
-        """Of paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
+        """Sort paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
         # The last key counts most: by receiver, then by delay.
         rank = np.lexsort((delay, owner))
         offsets = starts(np.bincount(owner, minlength=receivers))
@@ -60,12 +60,12 @@ class Paths:
         return (np.abs(self.gain.astype(np.complex128)) ** 2).sum(1)
 
     def select(self, selected: np.ndarray) -> Paths:
-        """Only the paths where `selected` (P,) bool is true; receivers stay."""
+        """Return only the paths where `selected` (P,) bool is true; receivers stay."""
         counts = np.bincount(self.owner[selected], minlength=len(self))
         return Paths(starts(counts), *(getattr(self, name)[selected] for name in ARRAYS))
 
     def take(self, receivers: np.ndarray) -> Paths:
-        """Receivers (n,) alone, in this order."""
+        """Return receivers (n,) alone, in this order."""
         counts = np.diff(self.offsets)[receivers]
         # Rows of all paths without a loop: where a group begins here, less where it will begin.
         first = np.repeat(self.offsets[receivers] - starts(counts)[:-1], counts)
@@ -73,27 +73,27 @@ class Paths:
         return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
     def under(self, effects: PropagationEffects) -> Paths:
-        """What remains of a full simulation under these switches."""
+        """Return what remains of a full simulation under these switches."""
         selected = self.select(effects.allows(self.mechanisms, self.order))
         return selected if effects.polarisation else replace(selected, gain=selected.gain[:, :1])
 
     def per_receiver(self, values: np.ndarray) -> np.ndarray:
-        """Sums of `values` (P,) over the paths of each receiver (R,)."""
+        """Return sums of `values` (P,) over the paths of each receiver (R,)."""
         return np.bincount(self.owner, weights=values, minlength=len(self))
 
     def received_power(self) -> np.ndarray:
-        """Mean power over a small area: the sum of path powers (R,)."""
+        """Return the mean power over a small area: the sum of path powers (R,)."""
         return self.per_receiver(self.power)
 
     def delay_spread(self) -> np.ndarray:
-        """Root-mean-square delay spread (R,) [s]; 0 where nothing arrives."""
+        """Return the root-mean-square delay spread (R,) [s]; 0 where nothing arrives."""
         # Where nothing arrives 0 is divided by the least float64.
         total = np.maximum(self.received_power(), np.finfo(float).tiny)
         mean = self.per_receiver(self.power * self.delay) / total
         return np.sqrt(self.per_receiver(self.power * (self.delay - mean[self.owner]) ** 2) / total)
 
     def responses(self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float) -> np.ndarray:
-        """Channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
+        """Return channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
 
         Args:
             frequency_hz: (K,) absolute frequencies [Hz].
@@ -126,7 +126,7 @@ def starts(counts: np.ndarray) -> np.ndarray:
 
 
 def join(parts: Sequence[Paths]) -> Paths:
-    """Receivers of all parts, one after the other."""
+    """Return receivers of all parts, one after the other."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
     return Paths(
         starts(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)

@@ -109,25 +109,25 @@ class RayTracer(Engine):
         ] = {}  # enlargement of the candidate buffer by effects
 
     def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
-        """The same scene with the transmitter elsewhere."""
+        """Return the same scene with the transmitter elsewhere."""
         other = copy(self)
         other.transmitter, other.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         return other
 
     def thinned(self, samples: int) -> RayTracer:
-        """The same scene with so many rays of a call."""
+        """Return the same scene with so many rays of a call."""
         other = copy(self)
         other.sampling = replace(self.sampling, samples=samples)
         return other
 
     def versions(self) -> dict[str, str]:
-        """Versions of the solver's packages."""
+        """Return versions of the solver's packages."""
         from importlib.metadata import version
 
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
 
     def materials(self) -> dict[str, dict[str, Any]]:
-        """ITU name, thickness [m] and scattering coefficient of every material in use."""
+        """Return ITU name, thickness [m] and scattering coefficient of every material in use."""
         return {
             name: {
                 "itu": getattr(m, "itu_type", None),
@@ -139,12 +139,12 @@ class RayTracer(Engine):
         }
 
     def surfaces(self) -> dict[str, Any]:
-        """Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
+        """Return Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths from the transmitter to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
+        """Trace paths to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
@@ -164,7 +164,7 @@ class RayTracer(Engine):
     def solutions(
         self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None
     ) -> Iterator[tuple[Any, int]]:
-        """Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
+        """Yield Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
 
         The scene holds these receivers until the next is asked for. Arguments and errors as of `trace`.
         """
@@ -266,20 +266,20 @@ class RayTracer(Engine):
             scene.add(rt.Receiver(f"rx{i}", position=point(place), orientation=ahead))
 
     def under_open_sky(self, points: np.ndarray) -> np.ndarray:
-        """Whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
+        """Tell whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
         return ~np.isfinite(self._hit(points, np.array([0.0, 0.0, 1.0])).t.numpy())
 
     def clear_of_surfaces(self, points: np.ndarray, gap: float) -> np.ndarray:
-        """Whether no surface is within `gap` [m] of points (N, 3) along the six axes."""
+        """Tell whether no surface is within `gap` [m] of points (N, 3) along the six axes."""
         axes = np.concatenate([np.eye(3), -np.eye(3)])
         return np.all([self._hit(points, axis).t.numpy() > gap for axis in axes], axis=0)
 
     def triangles(self) -> np.ndarray:
-        """(n, 3, 3) [m] of all objects."""
+        """Return triangles (n, 3, 3) [m] of all objects."""
         return np.concatenate([*self._objects().values()])
 
     def box(self) -> np.ndarray:
-        """(2, 3) lower and upper corner of everything [m]."""
+        """Return lower and upper corner (2, 3) [m] of everything."""
         corners = self.triangles().reshape(-1, 3)
         return np.stack([corners.min(0), corners.max(0)])
 
@@ -296,7 +296,7 @@ class RayTracer(Engine):
         return triangles
 
     def surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Highest surface (n,) [m] at places (n, 2) [m], -inf where there is none, and whether it is ground.
+        """Return the highest surface (n,) [m] at (n, 2) [m], -inf without one, and whether it is ground.
 
         The ground is the widest object whose area is mostly level; without one all is.
         """
@@ -313,7 +313,7 @@ class RayTracer(Engine):
         return height, (hit.shape == shape).numpy()
 
     def height(self, across: np.ndarray) -> np.ndarray:
-        """Of the highest surface (n,) [m] at places (n, 2) [m], -inf where there is none."""
+        """Return the highest surface (n,) [m] at places (n, 2) [m], -inf where there is none."""
         return self.surface(across)[0]
 
     def _ground(self) -> str | None:
@@ -326,7 +326,7 @@ class RayTracer(Engine):
         return max(level, key=level.__getitem__, default=None)
 
     def has_open_sky(self, area: np.ndarray) -> bool:
-        """Whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
+        """Tell whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
         low, top = self.box()[:, 2]
         height = self.height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
         return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
@@ -352,7 +352,7 @@ def _lattice(points: int) -> Any:
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
-    """Receivers of each call, and to how many it is filled up: a batch, a third of one; of few a ninth ..."""
+    """Divide receivers into calls, each filled up to a batch, a third of one; of few a ninth ..."""
     size, whole = Sampling(batch=batch).part, receivers // batch if receivers > batch else 0
     while size > 1 and math.ceil(size / 3) >= receivers:
         size = math.ceil(size / 3)

@@ -13,7 +13,7 @@ STATED = ("deliverable", "probes", "samples", "row_all", "row_chosen", "saved")
 
 
 def choice_table(choice: Choice) -> Table:
-    """A row per effect: its share of power, errors without it, its cost, kept or dropped."""
+    """Return a row per effect: its share of power, errors without it, its cost, kept or dropped."""
     table = Table(title=f"requirement: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
     table.add_column("left out")
     for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "probes off"):
@@ -31,13 +31,13 @@ def choice_table(choice: Choice) -> Table:
 
 
 def reasons(choice: Choice) -> list[str]:
-    """Expectations from physics, one line per effect."""
+    """Return expectations from physics, one line per effect."""
     by_effect = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
     return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in by_effect.items()]
 
 
 def verdict(choice: Choice) -> str:
-    """What was chosen, what it saves, and whether the requirement is met on held-back receivers."""
+    """Return what was chosen, what it saves, and whether the requirement is met on held-back receivers."""
     chosen = f"needed: {choice.effects}"
     chosen += "" if choice.samples is None else f", {choice.samples:,} rays"
     if choice.saved is not None and choice.row_chosen and choice.row_all:
@@ -56,7 +56,7 @@ def verdict(choice: Choice) -> str:
 
 
 def figures(outcome: Outcome) -> dict[str, Any]:
-    """Flat facts."""
+    """Return flat facts."""
     dataset = outcome.dataset
     facts: dict[str, Any] = {
         "dataset/name": dataset.data.site.name,
@@ -84,7 +84,7 @@ def figures(outcome: Outcome) -> dict[str, Any]:
 
 
 def closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
-    """What a simulation took, and how far two seeds of it are apart, in sentences."""
+    """Return what a simulation took, and how far two seeds of it are apart, in sentences."""
     count = len(outcome.survey)
     lines = [
         f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "

@@ -117,5 +117,5 @@ class RFIDSim(DataModule):
         self.stand_in = RFIDStandIn(**stand_in)
 
     def load(self) -> Measurements:
-        """Simulated when it is not there yet, then read like the release."""
+        """Simulate when it is not there yet, then read it like the release."""
         return simulated(self.stand_in, "RFID", load_rfid)

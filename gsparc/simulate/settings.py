@@ -41,7 +41,7 @@ class Campaign:
     measurement: str = "spectrum"
 
     def inputs(self) -> dict[str, str]:
-        """SHA-256 of the files that a scene and its receivers are read from."""
+        """Return the SHA-256 of the files that a scene and its receivers are read from."""
         files = (self.scene.file, self.scene.xml, (self.scene.receivers or {}).get("file"))
         return {
             str(file): hashlib.sha256(Path(file).read_bytes()).hexdigest()

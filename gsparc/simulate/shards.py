@@ -51,7 +51,7 @@ class Shards:
         _write(self.folder / NOTE, json.dumps(content, indent=1))
 
     def read_note(self) -> dict[str, Any] | None:
-        """The stored decision, or None."""
+        """Return the stored decision, or None."""
         path = self.folder / NOTE
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
@@ -61,7 +61,7 @@ class Shards:
         return {"plan_sha256": hashlib.sha256(self.plan.encode()).hexdigest()}
 
     def path(self, number: int) -> Path:
-        """File of a shard; it is there once the shard is finished."""
+        """Return the file of a shard; it is there once the shard is finished."""
         return self.folder / f"shard_{number:04d}.npz"
 
     def put(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
@@ -70,16 +70,16 @@ class Shards:
             np.savez(file, allow_pickle=False, **arrays)
 
     def numbers(self) -> list[int]:
-        """Numbers of the shards that are there."""
+        """Return numbers of the shards that are there."""
         return sorted(int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz"))
 
     def get(self, number: int, *names: str) -> dict[str, np.ndarray]:
-        """The arrays of a finished shard; `names` alone where given."""
+        """Return the arrays of a finished shard; `names` alone where given."""
         with np.load(self.path(number), allow_pickle=False) as file:
             return {name: file[name] for name in names or file.files}
 
     def of_rows(self, rows: np.ndarray, *names: str) -> list[np.ndarray]:
-        """Arrays of `names` (n, ...) at rows (n,), all of them in finished shards; no others are kept."""
+        """Return arrays of `names` (n, ...) at rows (n,), all in finished shards; no others are kept."""
         parts = []
         for number in self.numbers():
             stored = self.get(number, ROWS)[ROWS]
@@ -93,7 +93,7 @@ class Shards:
         return [one[at] for one in arrays]
 
     def remove(self) -> None:
-        """After the dataset is written."""
+        """Remove everything, after the dataset is written."""
         # Renamed first: a kill amid the removal would leave shards without the plan that they belong to.
         self._sweep()
         os.replace(self.folder, self._removed)

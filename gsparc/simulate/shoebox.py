@@ -48,7 +48,7 @@ class Room:
 
     @staticmethod
     def uniform(size: ArrayLike, reflection: complex | np.ndarray = -0.7, **kwargs) -> Room:
-        """A room from the origin to `size` (3,) [m]; `reflection` of all six walls, or (6,)."""
+        """Return a room from the origin to `size` (3,) [m]; `reflection` of all six walls, or (6,)."""
         return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ class Images:
         return np.abs(self.cell).sum(axis=1)
 
     def of(self, points: np.ndarray) -> np.ndarray:
-        """Images (..., I, 3) [m] of points (..., 3) [m]."""
+        """Return images (..., I, 3) [m] of points (..., 3) [m]."""
         return points[..., None, :] * self.signs + self.offsets
 
 
@@ -244,7 +244,7 @@ class ShoeboxEngine(Engine):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
     def supported(self, effects: PropagationEffects) -> PropagationEffects:
-        """Line of sight and specular reflection; walls do not transmit, edges do not diffract."""
+        """Keep line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
             polarisation=False,
@@ -252,7 +252,7 @@ class ShoeboxEngine(Engine):
         )
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
+        """Trace paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = images(self.room, effects.depth)
         seen = visible(self.room, mirrored, self.transmitter[None], receivers)
         if not effects.line_of_sight:
@@ -269,5 +269,5 @@ class ShoeboxEngine(Engine):
         )  # fmt: skip
 
     def materials(self) -> dict[str, dict[str, Any]]:
-        """Amplitude reflection coefficients of the walls."""
+        """Return the amplitude reflection coefficients of the walls."""
         return {f"wall{i}": {"reflection": abs(complex(r))} for i, r in enumerate(self.room.reflection)}

@@ -90,7 +90,7 @@ class SpectrumSettings(ArraySettings):
         return 2 * size**2 / wavelength
 
     def attributes(self) -> dict[str, str | float | int]:
-        """The definition as attributes of a file."""
+        """Return the definition as attributes of a file."""
         attributes = {f"spectrum_{key}": value for key, value in asdict(self).items()}
         drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")
         return {key: value for key, value in attributes.items() if key.removeprefix("spectrum_") not in drop}
@@ -99,7 +99,7 @@ class SpectrumSettings(ArraySettings):
 def spectra(
     paths: Paths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
+    """Return spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
 
     Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
     black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.

@@ -49,7 +49,7 @@ class Streets:
     ground: float = -0.5
 
     def blocked(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Whether a building stands between points a and b (S, 2) [m]: (S,) bool."""
+        """Tell whether a building stands between points a and b (S, 2) [m]: (S,) bool."""
         low, high = self.buildings[:, 0] + SHRINK, self.buildings[:, 1] - SHRINK
         along = (b - a)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -60,7 +60,7 @@ class Streets:
         return ((enter < leave) & (leave > 0) & (enter < 1)).any(axis=1)
 
     def open(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (S, 2) [m] lie outside every building: (S,) bool."""
+        """Tell whether points (S, 2) [m] lie outside every building: (S,) bool."""
         low, high = self.buildings[:, 0], self.buildings[:, 1]
         inside = (points[:, None] >= low) & (points[:, None] <= high)
         return ~np.any(np.all(inside, axis=-1), axis=1)
@@ -81,11 +81,11 @@ class Rays:
     direction: np.ndarray
 
     def at(self, users: np.ndarray) -> Rays:
-        """Those of some users (n,)."""
+        """Return the paths of some users (n,)."""
         return Rays(self.gain[users], self.delay[users], self.direction[users])
 
     def response(self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray) -> np.ndarray:
-        """Channels (U, A, K) complex128 at frequencies (K,) [Hz] of elements (A, 3) [m] about the base."""
+        """Return channels (U, A, K) complex128 at (K,) [Hz] of elements (A, 3) [m] about the base."""
         steering = np.exp(2j * np.pi * carrier_hz / LIGHT * (self.direction @ array.T))  # (U, P, A)
         turns = np.mod(self.delay[..., None] * frequency_hz, 1.0)
         return np.swapaxes(steering, 1, 2) @ (self.gain[..., None] * np.exp(-2j * np.pi * turns))
@@ -102,7 +102,7 @@ class _Route:
 
 
 def trace(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
-    """Paths from the base station to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
+    """Trace paths from the base to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
     routes = list(_routes(streets, users, wavelength))
     gain = np.zeros((len(users), 2 * len(routes)), complex)
     delay, direction = np.zeros(gain.shape), np.zeros((*gain.shape, 3))

@@ -56,15 +56,15 @@ class Survey:
         return np.tile(self.places, (len(self.engines), 1))
 
     def thinned(self, samples: int) -> Survey:
-        """The same with so many rays of a call."""
+        """Return the same with so many rays of a call."""
         return replace(self, engines=[engine.thinned(samples) for engine in self.engines])
 
     def distances(self) -> np.ndarray:
-        """Between the ends of each row (S,) [m]."""
+        """Return distances (S,) [m] between the ends of each row."""
         return np.linalg.norm(self.receivers - self.transmitters[self.station], axis=1)
 
     def spread(self, count: int, seed: int) -> np.ndarray:
-        """At most `count` rows far apart, transmitters by turns."""
+        """Choose at most `count` rows far apart, transmitters by turns."""
         order, turns = spread(self.places, min(count, len(self.places)), seed), len(self.engines)
         # Place i with transmitter i, then every place with the next one: all have their turn.
         rounds = [
@@ -73,7 +73,7 @@ class Survey:
         return np.concatenate(rounds)[:count]
 
     def trace(self, rows: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths of rows (n,), in their order."""
+        """Trace paths of rows (n,), in their order."""
         owner, place = np.divmod(rows, len(self.places))
         order = np.argsort(owner, kind="stable")
         parts = [
@@ -99,23 +99,23 @@ class Engine(Protocol):
     random: bool
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
-        """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
+        """Trace paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def materials(self) -> dict[str, dict[str, Any]]:
-        """Material properties of the scene, for provenance and physical expectations."""
+        """Return material properties of the scene, for provenance and physical expectations."""
 
     def supported(self, effects: PropagationEffects) -> PropagationEffects:
-        """These switches without what the engine cannot compute."""
+        """Return these switches without what the engine cannot compute."""
         return effects
 
     def thinned(self, samples: int) -> Self:
-        """The same with so many rays of a call, where there are any."""
+        """Return the same with so many rays of a call, where there are any."""
         return self
 
     def versions(self) -> dict[str, str]:
-        """Versions of the solver's packages."""
+        """Return versions of the solver's packages."""
         return {}
 
     def triangles(self) -> np.ndarray:
-        """(n, 3, 3) [m] of all objects, where they are triangles."""
+        """Return triangles (n, 3, 3) [m] of all objects, where they have any."""
         return np.zeros((0, 3, 3))

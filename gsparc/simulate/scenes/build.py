@@ -112,7 +112,7 @@ class SceneSettings:
 
 
 def from_config(config: Mapping[str, Any]) -> SceneSettings:
-    """Settings from the config group `scene`.
+    """Return settings from the config group `scene`.
 
     Raises:
         ValueError: a setting that does not exist or cannot be.
@@ -121,7 +121,7 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
 
 
 def build(scene: SceneSettings, sampling: Sampling) -> Survey:
-    """The scene with its transmitters and receivers.
+    """Build the scene with its transmitters and receivers.
 
     Raises:
         ValueError: no such scene, or no place for the receivers.
@@ -145,7 +145,7 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
 
 
 def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: float) -> SceneSettings:
-    """The scene that measurements were made in.
+    """Return the scene that measurements were made in.
 
     Args:
         stated: the name of a scene that comes with Sionna or is built here, or the path of an extract of
@@ -173,7 +173,7 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
 
 
 def names_scene(provenance: Mapping[str, str]) -> bool:
-    """Whether measurements come out of a scene that a ray tracer loads."""
+    """Tell whether measurements come out of a scene that a ray tracer loads."""
     try:
         return json.loads(provenance["scene"])["room"] is None
     except (KeyError, TypeError, ValueError):
@@ -181,7 +181,7 @@ def names_scene(provenance: Mapping[str, str]) -> bool:
 
 
 def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarray, name: str) -> RayTracer:
-    """The scene alone, to be traced from a place (3,) [m] with the antenna that it states there.
+    """Return the scene alone, to be traced from a place (3,) [m] with the antenna that it states there.
 
     Of several there, sectors of a mast, it is the one that `name` ends with; without one an isotropic one.
 

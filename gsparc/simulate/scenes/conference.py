@@ -20,7 +20,7 @@ WALLS = (  # material along the four walls, in panels from corner to corner
 
 
 def conference_room(seed: int = 0) -> list[Solid]:
-    """All objects of the room; the seed moves furniture and wall panels by decimetres."""
+    """Return all objects of the room; the seed moves furniture and wall panels by decimetres."""
     rng = np.random.default_rng(seed)
     return [*_shell(rng), *_partitions(), *_tables(rng), *_furniture(rng)]
 

@@ -59,7 +59,7 @@ class Town:
 
 
 def read_town(path: str | Path, carrier_hz: float) -> Town:
-    """Buildings and streets of an extract.
+    """Read buildings and streets of an extract.
 
     The ground's model is of 1 to 10 GHz; at other carriers [Hz] it is of concrete.
 

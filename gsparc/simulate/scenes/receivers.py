@@ -79,7 +79,7 @@ class Placed(NamedTuple):
 
 
 def layout(config: Mapping[str, Any] | None) -> Layout:
-    """Settings from `scene.receivers`.
+    """Return settings from `scene.receivers`.
 
     Raises:
         ValueError: a setting that does not exist or cannot be.
@@ -97,7 +97,7 @@ def receivers(
     streets: Sequence[np.ndarray] = (),
     georeference: Georeference | None = None,
 ) -> Placed:
-    """Places of the layout that stand nowhere else than on the ground.
+    """Return places of the layout that stand nowhere else than on the ground.
 
     Args:
         how, count: the layout, and the number of receivers over an area.
@@ -260,7 +260,7 @@ def place(
 
 
 def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
-    """A test of places (n, 3) [m]: which (n,) stand `margin` [m] away from all boxes and off all sheets."""
+    """Return a test: which places (n, 3) [m] stand `margin` [m] away from boxes and off sheets."""
     boxes = np.array([s.keep_out for s in solids if s.keep_out is not None]).reshape(-1, 2, 3)
     walls = [s.vertices for s in solids if s.keep_out is None]
 

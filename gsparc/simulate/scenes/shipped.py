@@ -8,7 +8,7 @@ from typing import Any
 
 
 def shipped() -> list[str]:
-    """Names, sorted; none where Sionna is not installed."""
+    """Return names, sorted; none where Sionna is not installed."""
     spec = importlib.util.find_spec("sionna")
     folders = () if spec is None else tuple(spec.submodule_search_locations or ())
     files = (path for folder in folders for path in Path(folder).glob("rt/scenes/*/*.xml"))
@@ -16,7 +16,7 @@ def shipped() -> list[str]:
 
 
 def settings(name: str) -> dict[str, Any]:
-    """What `scene=NAME` means for a shipped scene that has no file in `conf/scene`."""
+    """Return what `scene=NAME` means for a shipped scene that has no file in `conf/scene`."""
     return {
         "name": name, "builtin": name, "transmitter_m": None, "transmitters": None, "area_m": None,
         "height_m": [1.2, 1.8], "over": "ground", "receivers": None, "open_sky": None, "num_receivers": 1000,

@@ -76,7 +76,7 @@ def stations(
     surface: Callable[[np.ndarray], np.ndarray] | None,
     georeference: Georeference | None,
 ) -> list[Transmitter]:
-    """All sectors of all entries of `scene.transmitters`.
+    """Return all sectors of all entries of `scene.transmitters`.
 
     Args:
         entries: settings of `Mast`.
