@@ -129,12 +129,12 @@ def finite(numbers: Any) -> np.ndarray:
 
 
 def setting(default: Any, limit: Limit) -> Any:
-    """A field of a `Checked` dataclass."""
+    """Define a field of a `Checked` dataclass."""
     return dataclasses.field(default=default, metadata={"limit": limit})
 
 
 def internal(default: Any) -> Any:
-    """A field of a dataclass of settings that configurations leave out."""
+    """Define a field of a dataclass of settings that configurations leave out."""
     return dataclasses.field(default=default, metadata={"internal": True})
 
 

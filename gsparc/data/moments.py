@@ -35,7 +35,7 @@ class Snapshots:
 
     @classmethod
     def of(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
-        """Of rows (S,): the i-th visit of each station to a place is one moment."""
+        """Arrange rows (S,): the i-th visit of each station to a place is one moment."""
         station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
         moment = moments(data, rows)
         _, first = np.unique(moment, return_index=True)
@@ -53,19 +53,19 @@ class Snapshots:
         return replace(one, values=one.arranged(target))
 
     def arranged(self, rows: np.ndarray) -> np.ndarray:
-        """Values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""
+        """Return values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""
         values = np.zeros_like(self.values)
         for offset in range(rows.shape[1]):
             values[self.moment, self.antenna + offset] = rows[:, offset]
         return values
 
     def to_rows(self, factors: np.ndarray) -> np.ndarray:
-        """Factors (S, 1, K) of rows, by those (n, K) of moments."""
+        """Return factors (S, 1, K) of rows, by those (n, K) of moments."""
         return factors[self.moment][:, None]
 
 
 def moments(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Numbers (S,) of the moments of rows; without stations, or places in common, each has its own."""
+    """Return numbers (S,) of the moments of rows; without stations, or places in common, each has its own."""
     if data.station is None or data.place is None:
         return np.arange(len(rows))
     visit = _visits(data.place[rows], data.station[rows])

@@ -76,7 +76,7 @@ class Links:
     georeference: Georeference | None = None
 
     def named(self, rows: list[str]) -> list[str]:
-        """Names (S,) of rows, with their stations."""
+        """Return names (S,) of rows, with their stations."""
         if self.stations is None or self.station is None:
             return rows
         names = self.stations.name
@@ -158,7 +158,7 @@ class Site:
         return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
 
     def need_phase(self, what: str) -> None:
-        """`ValueError` where rows have phases of their own, so that `what` cannot be told."""
+        """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""
         if self.freedom != "none":
             raise ValueError(f"{what}: channels are known up to {words(self.freedom)} of each row")
 
@@ -168,7 +168,7 @@ class Site:
         return OTHER.get(self.static_end or "", "rx")
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Positions [m] of what moves: (B, 3) of one end (or a receiver for all), or (B, 6) of both."""
+        """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6) of both."""
         place = rx.position.reshape(-1, 3)
         if self.static_end is None:
             return torch.cat([tx, place.expand(len(tx), 3)], dim=1)
@@ -200,12 +200,12 @@ class Site:
         return None
 
     def array_geometry(self) -> tuple[np.ndarray, SphereGrid, float]:
-        """Array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""
+        """Return the array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""
         assert self.array is not None and self.grid is not None and self.wavelength is not None
         return self.array, self.grid, self.wavelength
 
     def power_unit(self, name: str | None = None) -> PowerUnit:
-        """Between stored powers and values in a unit; None: that of the measurements.
+        """Return what turns stored powers into a unit and back; None: that of the measurements.
 
         Raises:
             ValueError: see `PowerUnit.of`.
@@ -213,7 +213,7 @@ class Site:
         return PowerUnit.of(name or self.unit, self.level_unit, self.target_scale)
 
     def in_levels(self, unit: str | None) -> Site:
-        """The same, its levels and answers in a unit of levels; None: as they are.
+        """Return the same, its levels and answers in a unit of levels; None: as they are.
 
         Raises:
             ValueError: another unit, or one that these levels cannot be turned into.
@@ -223,7 +223,7 @@ class Site:
         return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
 
     def tones(self) -> np.ndarray:
-        """Frequencies (K,) float64 [Hz] of the channel; `ValueError` when nothing names them."""
+        """Return frequencies (K,) float64 [Hz] of the channel; `ValueError` when nothing names them."""
         if self.subcarriers_hz is not None:
             return np.asarray(self.subcarriers_hz, dtype=np.float64)
         if self.carrier_hz is None:
@@ -295,7 +295,7 @@ class Measurements:
         return self.tx if self.site.moving_end == "tx" else self.rx_position
 
     def side(self, rows: np.ndarray) -> np.ndarray:
-        """`censored` of rows (n,), (n,) int8."""
+        """Return `censored` of rows (n,), (n,) int8."""
         return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
@@ -374,7 +374,7 @@ NORMALISATIONS = ("max", "minmax", "power", "none")
 
 
 def axes_from(letter: str) -> dict[str, set[int]]:
-    """Arrays that may have a row per sample (S), station (T) or path (P), and then their numbers of axes.
+    """Return arrays that may have a row per sample (S), station (T) or path (P), and how many axes.
 
     >>> axes_from("T")["carrier_hz"]  # a frequency for each station
     {1}

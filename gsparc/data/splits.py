@@ -50,7 +50,7 @@ class Fold:
     test: np.ndarray
 
     def each(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
-        """The three parts changed alike."""
+        """Return the three parts changed alike."""
         return Fold(*map(change, (self.train, self.val, self.test)))
 
 
@@ -293,7 +293,7 @@ def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
 
 
 def tenth(floor: np.ndarray) -> float:
-    """Side [m] of squares of which ten hold the longer side of places (n, 2)."""
+    """Return the side [m] of squares of which ten hold the longer side of places (n, 2)."""
     return float(np.ptp(floor, axis=0).max()) / 10 * (1 + 2 * EDGE)
 
 

@@ -61,7 +61,7 @@ class SampleMetric(Metric):
             getattr(self, name).append(torch.as_tensor(value, dtype=torch.float64))
 
     def compute(self) -> dict[str, np.ndarray]:
-        """Per-sample quantities, each (S,) float64.
+        """Return per-sample quantities, each (S,) float64.
 
         Raises:
             ValueError: no sample was added.
@@ -75,7 +75,7 @@ class SampleMetric(Metric):
 
     @staticmethod
     def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
-        """Flat figures from per-sample arrays (pooled over folds by concatenation)."""
+        """Return flat figures from per-sample arrays (pooled over folds by concatenation)."""
         raise NotImplementedError
 
 

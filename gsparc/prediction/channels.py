@@ -115,7 +115,7 @@ class Paths:
     direction: np.ndarray | None = None
 
     def channel(self, frequency_hz: np.ndarray) -> np.ndarray:
-        """The sum of the paths (B, A, K) complex64 at tones (K,) [Hz], of paths at positions.
+        """Return the sum of the paths (B, A, K) complex64 at tones (K,) [Hz], of paths at positions.
 
         `csi` less this is what the model adds to channels that are no paths: a residual, or other solutions.
         """
@@ -126,12 +126,12 @@ class Paths:
 
 
 def judged(method: Method, site: Site, uplink: Any) -> Prediction:
-    """Channels of the measured tones in stored units with what else is said of them; see `_heard`."""
+    """Return channels of the measured tones in stored units with what else is said of them; see `_heard`."""
     return method.predict(_heard(method, site, uplink))
 
 
 def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
-    """Channels (B, A, K) in physical units from uplinks (B, U, L) in physical units.
+    """Return channels (B, A, K) in physical units from uplinks (B, U, L) in physical units.
 
     Raises:
         ValueError: the model reads no uplink, or one of another shape.
@@ -145,7 +145,7 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
 
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
-    """The sources of uplinks (B, U, L), physical units; see `_heard`."""
+    """Return the sources of uplinks (B, U, L), physical units; see `_heard`."""
     query = _heard(method, site, uplink)
     assert query.uplink is not None and site.uplink_hz is not None
     sources = _separator(method).sources(query.uplink)
@@ -155,7 +155,7 @@ def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
 
 
 def placed_paths(method: Method, site: Site, query: Query) -> Paths:
-    """The paths of a coherent field at positions in local coordinates.
+    """Return the paths of a coherent field at positions in local coordinates.
 
     Of several solutions that are averaged these are those of each that is made of paths, by its weight.
 
@@ -172,7 +172,7 @@ def placed_paths(method: Method, site: Site, query: Query) -> Paths:
 
 
 def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
-    """Channels (B, A, K) at other frequencies, and with `symbols` as [rx, rx_ant, tx, tx_ant, symbols, K].
+    """Return channels (B, A, K) at other frequencies, and with `symbols` as `resource_grid` does.
 
     Raises:
         ValueError: the model does not know its own frequencies, or those wanted lie outside its band.

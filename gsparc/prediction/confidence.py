@@ -26,7 +26,7 @@ KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the va
 
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """What `method` predicts of rows, and the rivals of its confidence."""
+    """Return what `method` predicts of rows, and the rivals of its confidence."""
     evidence = joined(
         [
             Evidence(rows[chosen], data.moving[rows[chosen]], *judged(said, batch.target))
@@ -37,7 +37,7 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
 
 
 def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state.
+    """Return relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state.
 
     `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
     (in a fade the same variance is a larger relative error); a method without them has no such kind.
@@ -50,14 +50,14 @@ def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, 
 
 
 def expected_score(prediction: Prediction) -> Tensor | None:
-    """Minus the error variance over the power predicted (B,); None without a variance."""
+    """Return minus the error variance over the power predicted (B,); None without a variance."""
     if prediction.variance is None:
         return None
     return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """The confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
+    """Return the confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
     known, kernel = known_positions(data, fold), position_kernel(data, fold)
     return {kind: rival_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
 
@@ -74,12 +74,12 @@ def rival_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray
 
 
 def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
-    """Of the moving end, local, that a method may have learned from (n, 3) [m]."""
+    """Return local places (n, 3) [m] of the moving end that a method may have learned from."""
     return data.moving[np.concatenate([fold.train, fold.val])]
 
 
 def position_kernel(data: Measurements, fold: Fold) -> Kernel:
-    """Of the process whose variance is the rival: length and noise by likelihood on a few known rows."""
+    """Choose the rival process's kernel: length and noise by likelihood on a few known rows."""
     known = np.concatenate([fold.train, fold.val])
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
@@ -87,7 +87,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """What a process of the positions `known` (n, 3) does not know of `places` (B, 3), share of the prior."""
+    """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
     white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
     return (1 + kernel.noise - white.square().sum(0)).numpy()
@@ -117,7 +117,7 @@ class Trusted:
     def confidence(
         self, prediction: Prediction, places: np.ndarray | None, kind: str | None = None
     ) -> np.ndarray:
-        """Confidence (B,) float32 in [0, 1] of predictions at local `places` (B, 3) [m] (None: unknown).
+        """Return confidences (B,) float32 in [0, 1] at local `places` (B, 3) [m] (None: unknown).
 
         Raises:
             ValueError: the method, or the checkpoint, does not have what `kind` needs.
@@ -167,7 +167,7 @@ def keep(path: str | Path, trusted: Trusted) -> None:
 
 
 def trusted_of(extra: Mapping[str, Any]) -> Trusted:
-    """What a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
+    """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
     state = extra.get(KEY)
     if state is None:
         return Trusted()
@@ -178,6 +178,6 @@ def trusted_of(extra: Mapping[str, Any]) -> Trusted:
 
 
 def threshold_of(kind: str, threshold: Threshold) -> float:
-    """A threshold of scores as one of confidences."""
+    """Return a threshold of scores as one of confidences."""
     value = np.array(threshold.value)
     return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")

@@ -56,7 +56,7 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
-    """The points in a checkpoint's `extra`, none when it was never swept."""
+    """Return the points in a checkpoint's `extra`, none when it was never swept."""
     sweep = extra.get(KEY) or {"points": [], "measured": {}}
     points = [Operating(**{**point, "figure": tuple(point["figure"])}) for point in sweep["points"]]
     return points, dict(sweep["measured"])
@@ -70,7 +70,7 @@ QUERIES = 16  # at places drawn in the scene's box
 
 
 def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Operating]:
-    """The most accurate stored operating point whose queries take at most `budget_ms` on this machine.
+    """Choose the most accurate stored operating point that takes at most `budget_ms` on this machine.
 
     Sets torch's number of threads to the point's.
 

@@ -19,7 +19,7 @@ SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in
 
 
 def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
-    """Places without a height at the one at which that end was measured, with a note.
+    """Put places without a height at the one at which that end was measured, with a note.
 
     Raises:
         DataError: it was measured at several heights, or the model does not say at which.
@@ -41,7 +41,7 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
 
 
 def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
-    """World positions (n, 3) [m] by end of places with heights.
+    """Return world positions (n, 3) [m] by end of places with heights.
 
     Raises:
         DataError: degrees where the model knows none, or a place that no measurement in metres can have.
@@ -79,7 +79,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
 
 
 def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
-    """In words that places which are `far` (n,) outside are so only in height; empty: they are not."""
+    """Say that places which are `far` (n,) outside are so only in height; empty: they are not."""
     low, high = site.moving_box[:, 2::3] + site.origin[2]
     ends = [end for end in ("tx", "rx") if end in world]
     heights = np.column_stack([world[end][:, 2] for end in ends])
@@ -94,7 +94,7 @@ def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
 
 
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
-    """In words that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
+    """Say that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
     wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in metres), default=0.0)
@@ -106,7 +106,7 @@ def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -
 
 
 def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Row of the places and number of the station (N,) int64 of each prediction; -1 without stations.
+    """Return row of the places and station (N,) int64 of each prediction; -1 without stations.
 
     Args:
         queries: a row about the station it names; where none are named, about every station.

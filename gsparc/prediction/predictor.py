@@ -311,7 +311,7 @@ class Predictor:
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
-        """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
+        """Return gains, delays and directions: of what an uplink (B, U, L) holds, or of a coherent field at
         positions; see `gsparc.prediction.channels`.
 
         Raises:

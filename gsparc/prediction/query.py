@@ -35,7 +35,7 @@ class Queries:
         self._still = None if still is None else Pose(_float(still), _float(self._rotation(None, 1)))
 
     def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Asked:
-        """Both ends as they were given, checked."""
+        """Check both ends as they were given, and return what is asked."""
         receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
             end: read_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None

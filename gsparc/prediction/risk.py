@@ -50,7 +50,7 @@ class Evidence:
 
 
 def joined(parts: Sequence[Evidence]) -> Evidence:
-    """Folds together; scores that not every part has are dropped."""
+    """Join folds; scores that not every part has are dropped."""
     kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
     scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
     facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
@@ -88,7 +88,7 @@ class Guarantee:
         return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
 
     def bad(self, relative_error: np.ndarray) -> np.ndarray:
-        """Whether predictions (n,) are bad."""
+        """Tell whether predictions (n,) are bad."""
         return relative_error > 10 ** (self.limit_db / 10)
 
 
@@ -110,7 +110,7 @@ class Threshold:
     bad: int
 
     def bound(self, delta: float) -> float:
-        """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
+        """Return the upper confidence bound on the share of bad ones accepted (Clopper and Pearson 1934)."""
         # Two tails of delta each: the upper end alone is exceeded with that probability.
         return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
 
@@ -130,7 +130,7 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
 
 
 def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
-    """Thresholds (at most `count`,) to try, strict to lax: quantiles of scores (n,) not the calibration's."""
+    """Return thresholds (at most `count`,), strict to lax: quantiles of scores (n,) not the calibration's."""
     return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
 
 
@@ -167,7 +167,7 @@ def choose(
 
 
 def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
-    """Variance of the share of bad ones (n,) between groups (n,) over that of independent draws; at least 1.
+    """Return the variance of the bad ones' share between groups (n,) over independent draws'; at least 1.
 
     A variance between few groups is itself uncertain: what is returned is its one-sided bound at
     `SURE_OF_EFFECT`, as of a normal variance.
@@ -193,7 +193,7 @@ def _tail(wrong: float, accepted: float, alpha: float) -> float:
 
 
 def bounded(relative_error: np.ndarray) -> np.ndarray:
-    """Losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
+    """Return losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
     return np.minimum(relative_error, 1.0)
 
 
@@ -246,7 +246,7 @@ class Trial:
     alpha: float
 
     def facts(self) -> dict[str, Any]:
-        """Figures over the draws; None of those that nothing was accepted in.
+        """Return figures over the draws; None of those that nothing was accepted in.
 
         `broken` is the share of draws with more than alpha bad ones, of the draws that accepted anybody, with
         Clopper and Pearson's 95 % interval as if they were independent (they share their positions: it is the
@@ -268,7 +268,7 @@ class Trial:
 def divided(
     evidence: Evidence, how: How, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Disjoint rows of the evidence: to choose on, to calibrate on, to test on.
+    """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
 
     `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
     across a cell's border.
@@ -291,7 +291,7 @@ def divided(
 
 
 def too_few(count: int, promise: Guarantee) -> str | None:
-    """What is missing for any promise on so many positions; None where there are enough."""
+    """Say what is missing for any promise on so many positions; None where there are enough."""
     needed = int(np.ceil(promise.least / SHARES[1]))
     if count >= needed:
         return None
@@ -302,7 +302,7 @@ def too_few(count: int, promise: Guarantee) -> str | None:
 
 
 def laxer(evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int) -> Guarantee | None:
-    """The same promise with the least larger limit, in whole decibels, that these positions keep; or None."""
+    """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(promise, limit_db=float(limit))
         if np.isfinite(accept(evidence, other, kind, spatial, seed)[1].value):
@@ -311,7 +311,7 @@ def laxer(evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed
 
 
 def cells(position: np.ndarray) -> np.ndarray:
-    """Which patch of the plane each position (n, 3) lies in: (n,) numbers from 0; on a plumb line, of it."""
+    """Number the patch of the plane that each position (n, 3) lies in, (n,); on a plumb line, of it."""
     flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
     cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
@@ -319,7 +319,7 @@ def cells(position: np.ndarray) -> np.ndarray:
 
 
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
-    """The confidence of the smallest area under risk-coverage on `rows`."""
+    """Return the confidence of the smallest area under risk-coverage on `rows`."""
     loss = bounded(evidence.error[rows])
     return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
 
@@ -332,7 +332,7 @@ def accept(
     seed: int | list[int],
     apart_m: float = 0,
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
-    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
+    """Return confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
 
     Raises:
         ValueError: `kind` is no confidence of this evidence.
@@ -378,7 +378,7 @@ def trials(
 
 
 def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
-    """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
+    """Return flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
     loss = bounded(evidence.error)
     perfect = risk_coverage(-loss, loss).mean()
     facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": float(perfect)}

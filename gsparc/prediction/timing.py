@@ -57,7 +57,7 @@ def interleaved(
     settings: ClockSettings | None = None,
     threads: Mapping[Key, int] | None = None,
 ) -> dict[Key, np.ndarray]:
-    """Wall times (rounds * calls,) [ms] of each contender.
+    """Measure wall times (rounds * calls,) [ms] of each contender.
 
     Rounds alternate so that a competing process hits all of them alike; each timed call is given another
     number (to take another query each time) and the device is synchronised before the clock is read.
@@ -127,21 +127,21 @@ def percentiles(times: np.ndarray) -> tuple[float, float]:
 
 
 def queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Query]:
-    """Batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
+    """Return batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
     picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
     return [where.batch(pick) for pick in picks]
 
 
 def reference_copy() -> Call:
-    """A fixed piece of work, a 16 MiB copy, against which times of different machines can be read."""
+    """Return a fixed piece of work, a 16 MiB copy, against which times of different machines can be read."""
     source = torch.ones(COPY_BYTES // 4)
     target = torch.empty_like(source)
     return lambda turn: target.copy_(source)
 
 
 def machine_facts() -> dict[str, float | int | str | None]:
-    """`machine/*`: threads, cores, 1-minute load per core, processor and accelerator."""
+    """Return `machine/*`: threads, cores, 1-minute load per core, processor and accelerator."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     load = os.getloadavg()[0] / cores if hasattr(os, "getloadavg") else None
     return {
@@ -154,7 +154,7 @@ def machine_facts() -> dict[str, float | int | str | None]:
 
 
 def peak_memory() -> dict[str, float]:
-    """`memory/peak_mb`: largest resident set of the process so far [MB]; `memory/gpu_peak_mb` with CUDA."""
+    """Return `memory/peak_mb`, the largest resident set so far [MB]; `memory/gpu_peak_mb` with CUDA."""
     # In bytes on macOS, in KiB on Linux.
     unit = 1 if sys.platform == "darwin" else 1024
     facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6}

@@ -28,7 +28,7 @@ FROZEN = 1.5  # times the bytes that it must read
 
 
 def cases(counts: Sequence[int], projections: Sequence[Projection], batches: Sequence[int]) -> Iterator[Case]:
-    """All rows of the table, one alive at a time."""
+    """Yield all rows of the table, one alive at a time."""
     for count in counts:
         for projection in projections:
             field = scene(count, projection)
@@ -81,7 +81,7 @@ def claims(
     machine: Machine,
     clock: ClockSettings,
 ) -> list[Claim]:
-    """Every promise for one projection; `counts` ascending, the middle one for the static receiver."""
+    """Measure every promise for one projection; `counts` ascending, the middle one of static receivers."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

@@ -16,7 +16,7 @@ DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference
 
 
 def moving(scene: Scene, batch: int) -> Case:
-    """A query of a moving receiver: rasterize, as the model does (kernel); emission too (whole)."""
+    """Time a query of a moving receiver: rasterize, as the model does (kernel); emission too (whole)."""
     poses, tx = receivers(batch), places(batch).flip(0) + 1
     features = scene.features.expand(batch, -1, -1)
 
@@ -47,7 +47,7 @@ def plan(scene: Scene, batch: int) -> Case:
 
 
 def static(scene: Scene, batch: int) -> Case:
-    """A static receiver's plan made once: blend (kernel); emission too (whole)."""
+    """Time a static receiver's plan made once: blend (kernel); emission too (whole)."""
     pose = receiver()
     layout = scene.plan(pose)
     features = scene.features.expand(batch, -1, -1).contiguous()
@@ -68,7 +68,7 @@ def static(scene: Scene, batch: int) -> Case:
 
 
 def frozen(scene: Scene, batch: int) -> Case:
-    """A static receiver's weights as a sparse matrix: multiply (kernel); its emissions too (whole)."""
+    """Time a static receiver's weights as a sparse matrix: multiply (kernel); its emissions too (whole)."""
     pose = receiver()
     view = freeze(scene.plan(pose), *scene.geometry, version=0)
     whole = frozen_view(scene.model, pose)
@@ -84,7 +84,7 @@ def frozen(scene: Scene, batch: int) -> Case:
 
 
 def backward(scene: Scene, batch: int) -> Case:
-    """Gradients of blending (kernel); a training step's forward and backward (whole)."""
+    """Time gradients of blending (kernel); a training step's forward and backward (whole)."""
     pose = receiver()
     layout = scene.plan(pose)
     means, quats, scales, opacities = (tensor.clone().requires_grad_() for tensor in scene.geometry)
@@ -122,7 +122,7 @@ def backward(scene: Scene, batch: int) -> Case:
 
 
 def weights(scene: Scene, batch: int) -> Case:
-    """Visible shares for channels: plan and weights (kernel)."""
+    """Time visible shares for channels: plan and weights (kernel)."""
     poses = receivers(batch)
     pairs = machine_limits.pairs(scene.plan(poses, channels=True))
     return Case(

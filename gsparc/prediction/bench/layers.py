@@ -23,7 +23,7 @@ NAMES = {PAPER: "emission 3-16-2", NETWORK: "emission 63-32-2"}
 
 
 def emission(count: int, batch: int, settings: EmissionSettings = PAPER) -> Case:
-    """Networks of N Gaussians at B positions (kernel); encoding, distances and activation too (whole)."""
+    """Time networks of N Gaussians at B positions (kernel); with encoding and activation (whole)."""
     model = scene(count, "tangent", settings).model
     layers = _layers(model.emission)
     where = places(batch)
@@ -38,7 +38,7 @@ def emission(count: int, batch: int, settings: EmissionSettings = PAPER) -> Case
 
 
 def emission_backward(count: int, batch: int) -> Case:
-    """Gradients of the networks' weights, the forward pass included."""
+    """Time gradients of the networks' weights, the forward pass included."""
     model = scene(count, "tangent").model
     layers = [layer.requires_grad_() for layer in _layers(model.emission)]
     encoded = model.emission.encoding(places(batch))
@@ -58,7 +58,7 @@ def emission_backward(count: int, batch: int) -> Case:
 
 
 def loss(batch: int) -> Case:
-    """L1 and SSIM of B spectra with their gradient."""
+    """Time L1 and SSIM of B spectra with their gradient."""
     draw = torch.Generator().manual_seed(0)
     shape = (batch, GRID.height, GRID.width)
     target = torch.rand(shape, generator=draw)
@@ -83,7 +83,7 @@ def loss(batch: int) -> Case:
 
 
 def channel(field: Scene, antennas: int, subcarriers: int) -> Case:
-    """Antennas x subcarriers at a moving receiver: the factored sum (kernel); all of the query (whole)."""
+    """Time antennas x subcarriers at a moving receiver: the factored sum (kernel); the query (whole)."""
     count, draw = len(field), torch.Generator().manual_seed(0)
     steering = torch.randn(count, antennas, 2, generator=draw)
     delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
@@ -116,7 +116,7 @@ COUNT, BATCH = 100, 16  # as many Gaussians as the dense tensors of plain PyTorc
 
 
 def step(projection: Projection, count: int = COUNT, batch: int = BATCH) -> Case:
-    """Emission, plan, blending, L1 and SSIM, their gradients and Adam; the reference does it in PyTorch."""
+    """Time emission, plan, blending, L1 and SSIM, gradients and Adam; the reference in PyTorch."""
     model = scene(count, projection).model
     parameters = 4 * sum(parameter.numel() for parameter in model.parameters())
     return Case(

@@ -62,7 +62,7 @@ class Case:
 
 
 def size(tensors: Iterable[Tensor]) -> int:
-    """Bytes of tensors."""
+    """Count the bytes of tensors."""
     return sum(tensor.nbytes for tensor in tensors)
 
 
@@ -94,13 +94,13 @@ class Row:
 
 
 def timed(calls: Mapping[str, Call | None], clock: ClockSettings) -> dict[str, np.ndarray]:
-    """Wall times of calls in turns [ms]; None is left out."""
+    """Time calls in turns [ms]; None is left out."""
     known = {name: call for name, call in calls.items() if call is not None}
     return interleaved({name: lambda turn, call=call: call() for name, call in known.items()}, clock)  # type: ignore[misc]
 
 
 def undisturbed(times: np.ndarray) -> float:
-    """The fastest fifth of the rounds: a competing process stretches long calls more than short ones."""
+    """Return the fastest fifth of the rounds: other processes stretch long calls more than short ones."""
     return float(np.quantile(times, 0.2))
 
 
@@ -112,11 +112,11 @@ class Machine:
         self._target = torch.zeros_like(self._source)
 
     def copy(self) -> int:
-        """Returns the bytes moved."""
+        """Copy; return the bytes moved."""
         return machine_limits.copy(self._source, self._target)
 
     def exponentials(self) -> int:
-        """Returns how many."""
+        """Evaluate exponentials; return how many."""
         return machine_limits.exponentials(MARK_TASKS)
 
 
@@ -149,7 +149,7 @@ def measure(
 
 
 def facts(row: Row) -> dict[str, float | str | None]:
-    """Flat keys of one row for the summary; times in milliseconds."""
+    """Return flat keys of one row for the summary; times in milliseconds."""
     stem = f"bench/{row.case.key}/t{row.threads}"
     values: dict[str, float | str | None] = {
         f"{stem}/limit_ms": row.limit,

@@ -55,7 +55,7 @@ class Scene:
         return len(self.features)
 
     def plan(self, pose: Pose, *, channels: bool = False, backend: str | None = None) -> Plan:
-        """Of spectra, or of the visibility that channels need."""
+        """Plan for spectra, or for the visibility that channels need."""
         grid, cutoff = (CHANNEL_GRID, CHANNEL_CUTOFF) if channels else (GRID, IMAGE_CUTOFF)
         return make_plan(
             *(*self.geometry, pose, grid), projection=self.projection, cutoff=cutoff, backend=backend
@@ -65,7 +65,7 @@ class Scene:
 def scene(
     count: int, projection: Projection, emission: EmissionSettings = PAPER, backend: str | None = None
 ) -> Scene:
-    """A room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
+    """Return a room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
     with torch.random.fork_rng():
         torch.manual_seed(count)
         settings = ModelSettings(
@@ -82,18 +82,18 @@ def scene(
 
 
 def places(count: int) -> Tensor:
-    """Positions (count, 3) [m] around the middle of the room (seeded)."""
+    """Return positions (count, 3) [m] around the middle of the room (seeded)."""
     draw = torch.Generator().manual_seed(count)
     return torch.randn(count, 3, generator=draw).clamp(-2, 2) * torch.tensor([1.0, 1.0, 0.3])
 
 
 def receivers(count: int) -> Pose:
-    """One pose per sample, upright."""
+    """Return one pose per sample, upright."""
     return Pose.identity(places(count))
 
 
 def receiver() -> Pose:
-    """One pose for a whole batch."""
+    """Return one pose for a whole batch."""
     return Pose.identity(places(1)[0])
 
 
