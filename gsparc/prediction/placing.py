@@ -83,6 +83,7 @@ def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
     low, high = site.moving_box[:, 2::3] + site.origin[2]
     ends = [end for end in ("tx", "rx") if end in world]
     heights = np.column_stack([world[end][:, 2] for end in ends])
+    # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
     flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
     if far_outside(flat, site)[0].any():

@@ -72,6 +72,7 @@ class Predictor:
         self.extra = extra or {}
         self.trusted, self.kind = trusted or Trusted(), kind
         self.method, self.site, self.point = method, site, point
+        # A reduced method answers means alone: what states variance or confidence asks the whole one.
         self._whole = whole or method
         self._query = Queries(site).query
         self._unit = unit
@@ -233,9 +234,11 @@ class Predictor:
 
         Stations that the model has no answer for, as they had too few training rows, are NaN.
         """
+        # 0 where both ends move: then there is no station that a query could leave out.
         said = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
         if said or self.site.kind != "rssi" or self.site.stations is None:
             return ask(self)
+        # One call for all stations where the method has one, else a call for each.
         every = self.method.every() if isinstance(self.method, PerStation) else None
         if every is not None:
             site = of_station(self.site, 0)
@@ -306,6 +309,7 @@ class Predictor:
             answer = channels.on_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
+        # A single position comes back without its leading axis.
         channel = channel[None] if channel.ndim == 2 else channel
         answer = channels.on_grid(channel, self.site, frequency_hz, symbols)
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
@@ -423,6 +427,7 @@ class Predictor:
             raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
         ends, fixed = {"tx": tx, "rx": rx}, []
         if isinstance(rx, Pose):
+            # Gradients are by the position of a pose; its rotation must not ask for one.
             ends["rx"], fixed = rx.position, [rx.rotation]
         if self.site.static_end is not None:
             fixed.append(ends.pop(self.site.static_end))

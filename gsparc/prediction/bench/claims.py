@@ -128,6 +128,7 @@ def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
     results = []
     for small, large in pairwise(fields):
         doublings = np.log2(len(large) / len(small))
+        # Sizes need not be powers of two apart: the ratio is reduced to one doubling.
         growth = (times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
         results.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
     return results

@@ -113,6 +113,7 @@ def backward(scene: Scene, batch: int) -> Case:
     work = _blending(scene, pose, batch * COMPLEX)
     return Case(
         *("backward", scene.projection, len(scene), batch),
+        # Inputs are read and gradients of the same shapes written.
         work=Work(2 * work.bytes, work.pairs),
         kernel=kernel,
         whole=whole,

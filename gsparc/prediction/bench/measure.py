@@ -129,6 +129,7 @@ def measure(
     threads = threads or before
     torch.set_num_threads(threads)
     try:
+        # How much the two marks do in one call.
         moved, counted = machine.copy(), machine.exponentials()
         calls = {"kernel": case.kernel, "whole": case.whole}
         times = timed(calls | {"exponentials": machine.exponentials, "copy": machine.copy}, clock)
@@ -138,6 +139,7 @@ def measure(
         torch.set_num_threads(before)
     by_bytes = undisturbed(times["copy"]) * case.work.bytes / moved
     by_pairs = undisturbed(times["exponentials"]) * case.work.pairs / counted
+    # The roofline: at best memory and arithmetic overlap, and the slower one is the limit.
     limit = max(by_bytes, by_pairs)
     return Row(
         *(case, threads, times["kernel"], times.get("whole")),

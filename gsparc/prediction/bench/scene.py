@@ -66,6 +66,7 @@ def scene(
     count: int, projection: Projection, emission: EmissionSettings = PAPER, backend: str | None = None
 ) -> Scene:
     """Return a room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
+    # Seeded without touching the draws of whoever calls.
     with torch.random.fork_rng():
         torch.manual_seed(count)
         settings = ModelSettings(
