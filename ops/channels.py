@@ -69,6 +69,7 @@ def summed(
     turns = torch.outer(delays, tones[0] + tones[1] * numbers)
     # Whole turns go first: 2 pi times 1e6 turns would round six digits of the phase away.
     phase = -2 * math.pi * (turns - turns.detach().floor())
+    # Sines of a float64 phase; products in the precision of the gains.
     factor = torch.polar(torch.ones_like(phase), phase).to(
         torch.view_as_complex(gains[:0].contiguous()).dtype
     )

@@ -159,6 +159,7 @@ def target(nvcc: str, arch: str) -> str:
             f"this GPU is sm_{arch} and {nvcc} builds for sm_{known[0]} and newer; "
             "set CUDA_HOME to an older CUDA toolkit"
         )
+    # PTX of the newest GPU that nvcc knows: the driver compiles it for this one.
     return f"-gencode=arch=compute_{older[-1]},code=compute_{older[-1]}"
 
 
@@ -170,6 +171,7 @@ def compile_to(path: Path, command: list[str]) -> None:
         raise LibraryUnavailable(
             f"no folder for the kernels: {error}; set XDG_CACHE_HOME to one that can be written"
         ) from error
+    # Processes may build at the same time: each writes its own file, and any of them is good.
     unfinished = path.with_suffix(f".{os.getpid()}")
     process = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
     if process.returncode:

@@ -64,6 +64,7 @@ class FrozenPlan:
             raise RuntimeError(
                 "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
             )
+        # The weights are the last of every backend's buffers.
         if features.dtype != self.buffers[-1].dtype:
             raise TypeError(
                 f"features are {features.dtype}, this view was frozen in {self.buffers[-1].dtype}"

@@ -91,6 +91,7 @@ def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
 def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
     """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
     requires_grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    # Tensors of inference mode can never become part of a graph.
     if requires_grad and plan.means2d.is_inference():
         raise RuntimeError(
             "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
@@ -121,6 +122,7 @@ def composite(
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     values = validation.features(features, means, plan.pose)
     validation.check_features(features)
+    # Kernels have first derivatives in reverse mode alone.
     plain = beyond_kernels(*gaussians, features)
     trained = _trained(plan, *gaussians, features) and not plain
     # A leaf of its own: after `backward` its `.grad` is the screen-space gradient that densification reads.

@@ -29,6 +29,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
         visible.append((alpha > 0).any(1))
         if ids is not None:
+            # The visible ones by depth: neighbours of equal distance and equal id have no order.
             ranks = orders[-1][visible[-1][orders[-1]]]
             if bool(((seen.distance[ranks].diff() == 0) & (ids[ranks].diff() == 0)).any()):
                 validation.raise_for_ids()
