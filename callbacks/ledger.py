@@ -43,6 +43,7 @@ class CostLedger(L.Callback):
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Stop the watch for work that is not training."""
+        # A pause within a pause must not start the watch when it ends.
         was_running = self._running_since is not None
         self._stop()
         try:

@@ -139,10 +139,12 @@ class Shared:
         prior = block.process.prior
         cross = deviation_of(prior) * block.process.cross(queries, own)
         factor = block.process.factor
+        # With less noise float32's rounding would show in the variance.
         rounded &= prior.kernel.noise >= ROUNDED_FROM
         white = (factor.whitened_rounded if rounded else factor.whitened)(cross.T).T
         if number not in self._weights:
             rest = (block.values - block.columns @ self.mean)[:, None]
+            # The rest is whitened: K^-1 L rest = L^-T rest.
             self._weights[number] = factor.solved(factor.lower @ rest)[:, 0]
         more = columns @ self.mean + cross @ self._weights[number]
         if not len(self.mean):

@@ -17,6 +17,7 @@ class Cancelled(BaseException):
 def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
     """Within, this thread is asked `condition` as `name`, beside what surrounds it."""
     before = getattr(_asked, name, None)
+    # What surrounds it is asked first: an outer end is one of all within.
     setattr(_asked, name, condition if before is None else lambda: before() or condition())
     try:
         yield

@@ -219,6 +219,7 @@ def reasons(
     distance = float(np.median(distances))
     sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
     zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
+    # A coefficient S scatters the share S^2 of what is reflected (V. Degli-Esposti et al. 2007).
     rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
     reasons = {
         "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",

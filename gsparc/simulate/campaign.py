@@ -58,6 +58,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     """
     if out.exists():
         raise ValueError(f"out={out} exists; remove it or choose another")
+    # One more than there are stages: their differences are what each took.
     laps = [time.perf_counter()]
     survey = build(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()})

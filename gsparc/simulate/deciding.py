@@ -96,6 +96,7 @@ class Traced:
         """Return paths of rows (n,), tracing those that were not traced before."""
         missing = np.setdiff1d(rows, self.rows)
         if len(missing):
+            # A call that is half full costs as much: it is filled up with rows that follow anyway.
             waiting = self._ahead[~np.isin(self._ahead, np.concatenate([self.rows, missing]))]
             missing = np.concatenate([missing, waiting[: -len(missing) % self._size]])
             begin = busy_s()

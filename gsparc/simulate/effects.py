@@ -88,6 +88,7 @@ class PropagationEffects:
             order: (P,) number of interactions.
         """
         bits = sum(bit for name, bit in BITS.items() if getattr(self, name))
+        # No interaction of a path may be of a kind that is off; order 0 is the line of sight.
         allowed = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
         return allowed & (order <= self.depth) & (self.line_of_sight | (order > 0))
 

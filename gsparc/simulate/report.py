@@ -32,6 +32,7 @@ def choice_table(choice: Choice) -> Table:
 
 def reasons(choice: Choice) -> list[str]:
     """Return expectations from physics, one line per effect."""
+    # All depths share one reason.
     by_effect = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
     return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in by_effect.items()]
 

@@ -97,6 +97,7 @@ def images(room: Room, max_order: int) -> Images:
     """
     reach = range(-max_order, max_order + 1)
     cells = [c for c in product(reach, repeat=3) if sum(map(abs, c)) <= max_order]
+    # By number of reflections, so that the first is the point itself.
     cell = np.array(sorted(cells, key=lambda c: (sum(map(abs, c)), c)), dtype=np.int64)
     signs, offsets = _mirror(room, cell)
     steps = np.abs(cell)
@@ -128,6 +129,7 @@ def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray
         return seen
     places = images.of(source)
     for i, cell in enumerate(images.cell):
+        # The cells between the room and the image: a straight line to it stays within them.
         crossed = product(*(range(min(0, c), max(0, c) + 1) for c in cell))
         signs, offsets = _mirror(room, np.array(list(crossed), dtype=np.int64))
         for low, high in room.occluders:

@@ -165,6 +165,7 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
         suffix = Path(stated).suffix.lower()
         builtin = "builder" if stated in BUILDERS else "builtin"
         source: dict[str, Any] = {{".osm": "file", ".xml": "xml"}.get(suffix, builtin): stated}
+        # Receivers and band are formal here: the scene alone is loaded.
         scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **source)
     for path in (scene.file, scene.xml):
         if path is not None and not Path(path).is_file():

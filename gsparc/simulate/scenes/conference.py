@@ -39,6 +39,7 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
         inwards = np.cross([0, 0, 1], along / np.linalg.norm(along))
         cuts = np.linspace(0, 1, len(materials) + 1)
         cuts[1:-1] += rng.uniform(-0.05, 0.05, len(materials) - 1)
+        # Every second panel stands out: the paper's walls are irregular.
         depths = [0.0 if i % 2 else float(rng.uniform(0.04, 0.12)) for i in range(len(materials))]
         for i, material in enumerate(materials):
             base = start + cuts[i] * along + depths[i] * inwards

@@ -147,6 +147,7 @@ def _along(
     """Places (n, 2) [m] of a grid or along lines; times (n,) [s] of a trajectory."""
     if how.kind == "grid":
         low, high = area
+        # One more than there are spacings: both ends of a side count.
         counts = np.floor((high - low) / how.spacing_m).astype(int) + 1
         if counts.prod() > MOST:
             raise ValueError(f"scene.receivers.spacing_m={how.spacing_m:g}: {counts.prod():,} places")
@@ -170,6 +171,7 @@ def _along(
 def _lines(how: Layout) -> list[np.ndarray]:
     points: Any = how.points_m
     try:
+        # A list of lines, or the corners of one.
         nested = points is not None and np.ndim(points[0]) == 2
         lines = [np.array(line, dtype=np.float64) for line in (points if nested else [points])]
     except (TypeError, ValueError, IndexError):
