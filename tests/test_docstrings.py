@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"gsparc": "gsparc", "ops": "gsparc.ops", "callbacks": "gsparc.callbacks"}  # by folder
 # They ask for Sionna's solver, or for a cloud of a trained field.
 ELSEWHERE = ("gsparc.apps.export.along.link", "gsparc.apps.view.ply")
-LEAST = 60
+LEAST = 150
 
 
 def with_examples() -> dict[str, int]:
