@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 import tomllib
 from pathlib import Path
 
@@ -22,7 +21,8 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.experiment.cells import code_version, plugged
+from gsparc.evaluation.experiment import done
+from gsparc.evaluation.experiment.cells import plugged
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 
@@ -116,9 +116,9 @@ def test_another_text_of_a_plugin_is_another_method(installed, tmp_path, monkeyp
     before = []
     for number in (1, 22):
         file.write_text(f"class Own:\n    depth = {number}\n")
-        sys.modules.pop("my_plugin.method", None)
         importlib.invalidate_caches()
-        before.append(code_version({"_target_": "my_plugin.method.Own"}))
+        done._program.cache_clear()
+        before.append(done.program({"model": {"_target_": "my_plugin.method.Own"}}))
     assert before[0] != before[1]
 
 
