@@ -60,7 +60,7 @@ class State:
     @classmethod
     def of(cls, config: DictConfig, data: str = "", split: str = "") -> State:
         """Return the state of a resolved configuration on data (`content`) under a split (its hash)."""
-        kept = OmegaConf.masked_copy(config, [name for name in config if name not in WHERE])
+        kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
         named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
         files = {name: value for name, value in named.items() if isinstance(value, str)}
