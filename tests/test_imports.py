@@ -19,7 +19,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "processes", "physics", "data", "simulate", "field", "training", "models", "prediction"]
-ROOMS += ["locate", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
+ROOMS += [
+    "evaluation",
+    "apps.export",
+    "apps.link",
+    "apps.locate",
+    "apps.maps",
+    "apps.view",
+    "commands",
+    "callbacks",
+    "conf",
+]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -30,21 +40,30 @@ ARROWS = {
     "field": "data ops physics processes",
     "training": "data field ops",
     "models": "conf data field ops physics processes simulate training",
-    "prediction": "data field locate models ops physics processes training",
-    "locate": "data models processes training",
-    "evaluation": "conf data locate models prediction processes simulate training",
-    "maps": "data evaluation models prediction processes training",
-    "view": "data evaluation maps models ops prediction",
+    "prediction": "data field models ops physics processes training",
+    "apps.locate": "data evaluation models prediction processes training",
+    "evaluation": "conf data models prediction processes simulate training",
+    "apps.maps": "data evaluation models prediction processes training",
+    "apps.export": "data field models ops physics prediction processes training",
+    "apps.link": "data evaluation models prediction simulate",
+    "apps.view": "apps.maps data evaluation models ops prediction",
     "callbacks": "data evaluation field training",
-    "commands": "conf data evaluation locate maps models ops prediction simulate training view",
+    "commands": "apps.export apps.link apps.locate apps.maps apps.view conf "
+    "data evaluation models ops prediction simulate training",
     "conf": "",
 }
 LARGEST = ("models", "data", "commands")
 GROUPS = ("gsparc.models", "gsparc.datasets")  # of entry points: what plugins bring, by these very words
+
+
+def inside(room: str) -> str:
+    return f"gsparc/{room.replace('.', '/')}"
+
+
 FILES = [
     (room, file)
     for room in ROOMS
-    for file in sorted((ROOT / (room if (ROOT / room).is_dir() else f"gsparc/{room}")).rglob("*.py"))
+    for file in sorted((ROOT / (room if (ROOT / room).is_dir() else inside(room))).rglob("*.py"))
 ]
 
 
@@ -82,7 +101,8 @@ def needed(tree: ast.Module):
 
 def room_of(name: str) -> str | None:
     parts = name.split(".")
-    return parts[1] if parts[0] == "gsparc" and len(parts) > 1 and parts[1] in ROOMS else None
+    room = ".".join(parts[1 : 3 if parts[1:2] == ["apps"] else 2])
+    return room if parts[0] == "gsparc" and room in ROOMS else None
 
 
 @cache
@@ -149,10 +169,25 @@ def _of(name: str, files: dict[str, Path]) -> str | None:
 
 def test_strings_are_followed():
     tree = ast.parse(
-        'import_module("gsparc.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
+        'import_module("gsparc.apps.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
     )
-    assert list(named(tree)) == ["gsparc.maps.making", "gsparc.models.baselines.zero.Zero"]
+    assert list(named(tree)) == ["gsparc.apps.maps.making", "gsparc.models.baselines.zero.Zero"]
     assert ("evaluation", "conf") in arrows(), "the configuration is named in a string alone"
+
+
+def test_the_core_does_without_the_apps():
+    """What is done with predictions is known to the commands alone, also in functions and strings."""
+    above = [ROOT / "gsparc" / name for name in ("apps", "commands")]
+    rooms = [ROOT / name for name in ("gsparc", "ops", "callbacks", "bench", "hydra_plugins")]
+    core = [file for room in rooms for file in room.rglob("*.py") if not {*above} & {*file.parents}]
+    assert len(core) > 300
+    wrong = {file for file in core for name in (*_imports(file), *named(_tree(file))) if _is_app(name)}
+    wrong |= {file for file in (ROOT / "conf").rglob("*.yaml") if "gsparc.apps" in file.read_text("utf-8")}
+    assert not wrong
+
+
+def _is_app(name: str) -> bool:
+    return (name + ".").startswith("gsparc.apps.")
 
 
 def test_few_modules_lie_beside_the_rooms():
@@ -161,13 +196,13 @@ def test_few_modules_lie_beside_the_rooms():
 
 def test_only_the_viewers_server_imports_viser():
     used = [file for _, file in FILES if "viser" in {n.split(".")[0] for n in _imports(file)}]
-    assert used and {file.parent for file in used} == {ROOT / "gsparc" / "view" / "server"}
-    kept = ROOT / "gsparc" / "view" / "server"
+    assert used and {file.parent for file in used} == {ROOT / "gsparc" / "apps" / "view" / "server"}
+    kept = ROOT / "gsparc" / "apps" / "view" / "server"
     above = {
         file.relative_to(ROOT).as_posix()
         for _, file in FILES
         if file.parent != kept
-        and any(n.startswith("gsparc.view.server") for n in imported(_top(_tree(file))))
+        and any(n.startswith("gsparc.apps.view.server") for n in imported(_top(_tree(file))))
     }
     assert not above, "imported where it is needed, in a function: the command does without viser"
 

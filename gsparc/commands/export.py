@@ -10,16 +10,16 @@ import numpy as np
 from omegaconf import DictConfig
 
 import gsparc.ops
+from gsparc.apps.export.along import deepmimo
+from gsparc.apps.export.along.impulses import write_impulses
+from gsparc.apps.export.along.taps import Trajectory
+from gsparc.apps.export.compiled.blob import write
+from gsparc.apps.export.compiled.make import FIGURES, compiled
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
-from gsparc.prediction.along import deepmimo
-from gsparc.prediction.along.impulses import write_impulses
-from gsparc.prediction.along.taps import Trajectory
-from gsparc.prediction.compiled.blob import write
-from gsparc.prediction.compiled.make import FIGURES, compiled
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import in_world, with_heights
 from gsparc.prediction.predictor import Predictor

@@ -12,10 +12,10 @@ from omegaconf import DictConfig
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
+from gsparc.apps.link.run import LinkStudy
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.evaluation.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
-from gsparc.evaluation.link.run import LinkStudy
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import shown, table, write_summary
 

@@ -7,12 +7,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.locate.baselines.table import BASELINES
+from gsparc.apps.locate.judging import by_fingerprints, by_model, report
+from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.limits import POSITIVE, SHARE, choice, number, or_null, switch, whole
-from gsparc.evaluation.localisation import by_fingerprints, by_model, report
-from gsparc.locate.baselines.table import BASELINES
-from gsparc.maps.floor_plan import plan_of
 
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)), "track": switch(),

@@ -6,16 +6,16 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
+from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.making import map_of
+from gsparc.apps.maps.page import write_page
+from gsparc.apps.maps.pictures import draw_layer, file_name, layers
+from gsparc.apps.maps.promise import PromiseSettings
+from gsparc.apps.maps.promised import notes_of, promise_of
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
-from gsparc.maps.field_map import geotiff_wanted, write_geotiff
-from gsparc.maps.floor_plan import plan_of
-from gsparc.maps.making import map_of
-from gsparc.maps.page import write_page
-from gsparc.maps.pictures import draw_layer, file_name, layers
-from gsparc.maps.promise import PromiseSettings
-from gsparc.maps.promised import notes_of, promise_of
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.timing import peak_memory
 
@@ -80,5 +80,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         reach = promise.calibration(how.share).reach
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
-    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map "
+    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s)"
+    if field.calibrated:
+        before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
+    before += "; map "
     return finish(run_dir, facts, lines=lines, before=before)

@@ -6,12 +6,19 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.pictures import draw_placing
+from gsparc.apps.maps.placing import (
+    NewStation,
+    in_words,
+    new_station_error,
+    number,
+    place_next,
+    unheard_refused,
+)
+from gsparc.apps.maps.promised import promise_of, trained
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
-from gsparc.maps.pictures import draw_placing
-from gsparc.maps.placing import NewStation, in_words, new_station_error, number, place_next, unheard_refused
-from gsparc.maps.promised import promise_of, trained
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.prediction.operating_point import load

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.pictures import draw_plan_picture
+from gsparc.apps.maps.planning import plan_next
+from gsparc.apps.maps.promised import promise_of
 from gsparc.commands.map import settings_of, stations_of
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import plain
 from gsparc.evaluation.summary import write_samples
-from gsparc.maps.floor_plan import plan_of
-from gsparc.maps.pictures import draw_plan_picture
-from gsparc.maps.planning import plan_next
-from gsparc.maps.promised import promise_of
 from gsparc.prediction.operating_point import load
 
 
@@ -36,12 +36,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_plan_picture(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
-        "plan/places": len(plan.places), "plan/before_db": plan.before_db, "plan/after_db": plan.after_db,
+        "plan/places": len(plan.places), "plan/expected_error_db": plan.after_db,
+        "plan/expected_error_before_db": plan.before_db,
         "plan/length_m": plan.length_m, "plan/stopped": plan.stopped or None,
         "plan/scatter_db": plan.scatter_db, "plan/in_vain": int(bool(plan.in_vain)),
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
+    before += "" if predictor is None or predictor.site.stations is None else " of all stations"
     if config.route or config.route_m is not None:
         before += f", a walk of {plan.length_m:.4g} m"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]

@@ -38,7 +38,7 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    from gsparc.prediction.serving import Limits, Server, application
+    from gsparc.apps.export.serving import Limits, Server, application
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
     needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]

@@ -9,21 +9,21 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.making import place_of
+from gsparc.apps.maps.pictures import layers
+from gsparc.apps.view.building import Building, cloud_colours, cloud_of
+from gsparc.apps.view.ply import write_ply
+from gsparc.apps.view.site_view import SiteView, grid_for
+from gsparc.apps.view.still import draw_still
+from gsparc.apps.view.viewed import open_viewed
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.walls import read_walls
-from gsparc.maps.field_map import FieldMap
-from gsparc.maps.floor_plan import plan_of
-from gsparc.maps.making import place_of
-from gsparc.maps.pictures import layers
 from gsparc.prediction.timing import peak_memory
-from gsparc.view.building import Building, cloud_colours, cloud_of
-from gsparc.view.ply import write_ply
-from gsparc.view.site_view import SiteView, grid_for
-from gsparc.view.still import draw_still
-from gsparc.view.viewed import open_viewed
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     viewed, site = view.viewed, view.viewed.site
     facts = {
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
-        "ckpt": str(config.ckpt), "view/operating_points": len(viewed.ways), **peak_memory(),
+        "ckpt": str(config.ckpt), **peak_memory(),
     }  # fmt: skip
     return finish(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
 
@@ -71,7 +71,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 
 def serve(view: SiteView, host: str, port: int) -> str:
     """Until Ctrl-C; returns what is said then."""
-    from gsparc.view.server.serve import Server
+    from gsparc.apps.view.server.serve import Server
 
     server = Server(view, host, port)
     log.info("open %s in a browser; Ctrl-C ends it", server.address)
@@ -85,7 +85,7 @@ def write(view: SiteView, path: Path) -> str:
     if ending == ".png":
         draw_still(view, path)
     elif ending == ".html":
-        from gsparc.view.server.page import page
+        from gsparc.apps.view.server.page import page
 
         with whole_file(path) as partial:
             partial.write_text(page(view), encoding="utf-8")

@@ -11,6 +11,7 @@ from gsparc.data.units import in_decibels
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
+SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
@@ -52,21 +53,45 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
 
 
 def levels(data: Measurements) -> np.ndarray | None:
-    """Level (T,) [dB] below which each station hears nothing, NaN where it heard all; None without any."""
+    """Level (T,) [dB] below which each station hears nothing; None where every one heard all.
+
+    NaN where it heard all, or its silent rows have several levels, as in lists of the strongest.
+    """
     rows = np.flatnonzero(data.side(np.arange(len(data))) > 0)
     if not len(rows):
         return None
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
     level = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
-    level[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
+    power = data.target[rows, 0].astype(np.float64)
+    for number in np.unique(station[rows]):
+        own = power[station[rows] == number]
+        if np.ptp(own) <= SAME_LEVEL * own[0]:
+            level[number] = 10 * np.log10(own[0] * data.site.target_scale)
     return level
 
 
+def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
+    """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
+
+    That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
+    """
+    side, prediction = data.side(scores.row), scores.samples["prediction"]
+    if not side.any():
+        return {}
+    level = data.target[scores.row, 0].astype(np.float64) * data.site.target_scale
+    tiny = np.finfo(np.float64).tiny
+    beyond = side * 10 * np.log10(np.maximum(prediction, tiny) / np.maximum(level, tiny))
+    error = np.where(side == 0, scores.samples["error_db"], np.maximum(beyond, 0.0))
+    return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
+
+
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies, and of powers `power_intervals` and, of stations held out, `rmse_db_after_constant`."""
+    """Accuracies; of powers also `with_silent`, `power_intervals` and, of stations held out, errors left
+    after a constant of each.
+    """
     figures = scores.figures()
     if data.site.kind == "rssi":
-        figures |= power_intervals(scores, data)
+        figures |= with_silent(scores, data) | power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
             figures["rmse_db_after_constant"] = scores.after_constant(data.station)
     return figures

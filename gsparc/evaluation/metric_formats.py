@@ -37,6 +37,7 @@ FIGURES = {
     "snr_db": Figure("SNR dB", ".2f"),
     "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
     "rmse_db": Figure("RMSE dB", ".2f", "smaller"),
+    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller"),
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
     "skill": Figure("skill", ".3f"),

@@ -339,8 +339,8 @@ class OfStations(OfStation):
 
     def joint(self) -> HasJoint | None:
         """What knows how levels of stations go together; None where nothing does."""
-        field = getattr(self.inner, "field", None)
-        return field if isinstance(field, HasJoint) else None
+        method = getattr(self.inner, "only", None)
+        return method if isinstance(method, HasJoint) else None
 
     def predict(self, query: Query) -> Prediction:
         """Mean and variance (B, T); the ends that stand are not read."""

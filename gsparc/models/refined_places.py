@@ -20,7 +20,7 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.conditional import ConditionalField
+from gsparc.models.closed_form import ClosedForm
 from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
 
@@ -91,9 +91,7 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
     return unit * std[:, None], min(exact for _, exact, _ in tried) - least
 
 
-def refined(
-    field: ConditionalField, data: Measurements, std: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, str]:
+def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
     """Rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
@@ -113,7 +111,7 @@ def refined(
     return rows, moved.numpy()[place], f"{note}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
 
 
-def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray, Linearised]:
+def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linearised]:
     """Rows (n,) that the field was conditioned on, about their places.
 
     Raises:
@@ -122,7 +120,7 @@ def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray
     left, site = field.left_out(), data.site
     batch, moving = data.batch(left.rows), torch.from_numpy(data.moving[left.rows])
     if left.mean.numel() != batch.target.numel():
-        raise ValueError(f"{field.kind}: of several tones or antennas one is kept of rows left out")
+        raise ValueError(f"{field.name}: of several tones or antennas one is kept of rows left out")
     turned = batch.rx.rotation.double()
 
     def at(places: Tensor) -> Batch:
@@ -131,10 +129,10 @@ def _linearised(field: ConditionalField, data: Measurements) -> tuple[np.ndarray
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def mean(places: Tensor) -> Tensor:
-        return real(comparable(field(at(places)).mean, site))
+        return real(comparable(field.predict(at(places)).mean, site))
 
     with torch.no_grad():
-        result = field(at(moving))  # what is computed once and kept must not be so inside `jvp`
+        result = field.predict(at(moving))  # what is computed once and kept must not be so inside `jvp`
     assert result.variance is not None
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":

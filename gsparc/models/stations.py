@@ -15,16 +15,15 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
-from gsparc.models.conditional import ConditionalField
-from gsparc.models.fields import INITIALISERS
 from gsparc.models.method import Method
 from gsparc.models.per_station import of_station
+from gsparc.models.powers.field import PowerField
+from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.network import network_of
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
-PLAIN = InitSettings("diffuse")  # no Gaussians: asked is what stations share
 
 
 class LearnsTogether(Method):
@@ -75,7 +74,8 @@ def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["
         parts = list(_by_station(data, learned, queries, own))
         if not parts:
             continue
-        joint, _ = INITIALISERS["joint_powers"](data, learned, PLAIN, False, own)
+        joint = JointPowerField(shared=False, seed=context.seed)
+        joint.fit(data, Fold(learned, learned[:0], learned[:0]), own)
         rows = np.concatenate([part for part, _ in parts])
         separate = torch.cat([powers for _, powers in parts])
         target = _decibels(data.batch(rows).target)
@@ -99,13 +99,14 @@ def _by_station(
         known, left = (np.flatnonzero(np.isin(rows, part)) for part in (learned, queries))
         if len(known) >= LEAST_ROWS:
             part = data.subset(rows, of_station(data.site, number))
-            field, _ = INITIALISERS["powers"](part, known, PLAIN, False, context)
-            yield rows[left], _levels(field, part, left)
+            single = PowerField(waves=False, seed=context.seed)
+            single.fit(part, Fold(known, known[:0], known[:0]), context)
+            yield rows[left], _levels(single, part, left)
 
 
 @torch.no_grad()
-def _levels(field: ConditionalField, data: Measurements, rows: np.ndarray) -> Tensor:
-    return _decibels(field(data.batch(rows)).mean)
+def _levels(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
+    return _decibels(method.predict(data.batch(rows)).mean)
 
 
 def _decibels(power: Tensor) -> Tensor:

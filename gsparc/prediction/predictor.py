@@ -26,8 +26,7 @@ from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
-    from gsparc.locate.locator import Located, Locator
-    from gsparc.prediction.export import Paths
+    from gsparc.prediction.channels import Paths
     from gsparc.prediction.operating_point import Operating
 
 
@@ -77,7 +76,6 @@ class Predictor:
         self._query = Queries(site).query
         self._unit = unit
         self.unit = self._in(None).name  # "1" of channels and spectra
-        self._locators: dict[tuple[bytes, Any, float], Locator] = {}  # with what was looked up once
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
     def __repr__(self) -> str:
@@ -280,29 +278,29 @@ class Predictor:
             return self._ask("csi", tx, rx, grad)
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
-        from gsparc.prediction import export
+        from gsparc.prediction import channels
 
         if uplink is not None:
-            channel = export.uplink_channels(self.method, self.site, uplink, frequency_hz)
-            answer = export.on_grid(channel, self.site, None, symbols)
+            channel = channels.uplink_channels(self.method, self.site, uplink, frequency_hz)
+            answer = channels.on_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
         channel = channel[None] if channel.ndim == 2 else channel
-        answer = export.on_grid(channel, self.site, frequency_hz, symbols)
+        answer = channels.on_grid(channel, self.site, frequency_hz, symbols)
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
-        positions; see `gsparc.prediction.export`.
+        positions; see `gsparc.prediction.channels`.
 
         Raises:
             ValueError: the model's channels are not made of paths.
         """
-        from gsparc.prediction import export
+        from gsparc.prediction import channels
 
         if uplink is not None:
-            return export.uplink_paths(self.method, self.site, uplink)
-        return export.placed_paths(self._whole, self.site, self._query(tx, rx).query)
+            return channels.uplink_paths(self.method, self.site, uplink)
+        return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Received power (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
@@ -317,46 +315,6 @@ class Predictor:
             ValueError: no unit that these powers can be turned into, or as in `spectrum`.
         """
         return self._of_stations(lambda one: one._ask("rssi", tx, rx, grad, unit), tx, rx)
-
-    def locate(
-        self, values: Any, *, silent: Any = None, where: Any = None, phase_known: bool = False,
-        offset_db: float = 0.0, share: float = 0.9, unit: str | None = None,
-    ) -> list[Located]:  # fmt: skip
-        """Where snapshots were heard, by this model's likelihood, in world coordinates.
-
-        >>> city = gsparc.load("city.ckpt")
-        >>> city.locate([[-90.0, -75.2]])[0].place.shape  # (n, stations) [dBm]
-        (3,)
-
-        Args:
-            values: (n, ...) spectra, channels or powers; where there are stations (n, stations, ...), NaN
-                where one is missing.
-            silent: bool like powers, True where the value is the level below which nothing was heard.
-            where: (m, 3) world places near which one can stand; None: in the box of the measured ones.
-            phase_known: whether channels come in the phase of the trained ones.
-            offset_db: standard deviation of an offset that all powers of a snapshot share [dB].
-            share: of places that an area is to hold; kept by what `gsparc locate` learned for the same
-                settings and stored with the model, else as the model's own variances say.
-            unit: of powers; None: as they are answered.
-
-        Raises:
-            ValueError: values of another kind or shape, both ends move, or a model without variance.
-        """
-        from gsparc.locate import locator, snapshots
-
-        if self.site.kind == "rssi" and not np.iscomplexobj(values):
-            values = self._in(unit).stored(torch.as_tensor(values)) * self.site.target_scale
-        heard = snapshots.of_values(self.site, values, silent)
-        unknown = locator.Unknown(phase_known, offset_db)
-        low_high = self.site.moving_box[:, :3] + self.site.origin
-        places = low_high if where is None else np.atleast_2d(read_places("where", where))
-        key = (places.tobytes(), unknown, share)
-        if key not in self._locators:
-            cells = locator.cover(places - self.site.origin, locator.MOST, where is not None)
-            field = locator.SiteField(self.method, self.site)
-            trust = locator.restored(self.extra, unknown, share)
-            self._locators[key] = locator.Locator(field, cells, unknown, trust, share)
-        return [locator.in_world(one, self.site.origin) for one in self._locators[key].locate(heard)]
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """How sure the model is, (B,) float32 in [0, 1], larger is surer.
@@ -392,9 +350,9 @@ class Predictor:
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
         """Confidences (B,), whether one was wanted, and whether torch was given."""
         if uplink is not None:
-            from gsparc.prediction import export
+            from gsparc.prediction import channels
 
-            sure = self._confidence(export.judged(self.method, self.site, uplink), None)
+            sure = self._confidence(channels.judged(self.method, self.site, uplink), None)
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self._query(tx, rx)

@@ -52,16 +52,21 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
 
 
-def propagate(known: ConditionalGaussian, level: Tensor, side: Tensor | float = 1.0) -> Sites:
-    """Stand-ins for "below `level`" (m,), or "above" where `side` is -1, of a vector's unknown entries."""
+def propagate(
+    known: ConditionalGaussian, level: Tensor, side: Tensor | float = 1.0, start: Sites | None = None
+) -> Sites:
+    """Stand-ins for "below `level`" (m,), or "above" where `side` is -1, of a vector's unknown entries.
+
+    Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same.
+    """
     mean, covariance = known.mean, known.covariance
     total = covariance.diagonal()
-    value, variance = _sites(mean, total, level, side)
+    value, variance = (start.value, start.variance) if start else _sites(mean, total, level, side)
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
         factor = Factor.of(covariance + torch.diag(variance), "raise")
-        precision = factor.inverse.diagonal()
-        weights = factor.inverse @ (value - mean)
+        precision = factor.precision
+        weights = factor.solved((value - mean)[:, None])[:, 0]
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
         result, wide = _sites(cavity, cavity_variance, level, side)
@@ -124,7 +129,9 @@ class ConditionalGaussian:
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
 
-def log_evidence(gram: Tensor, values: Tensor, side: Tensor) -> tuple[float, Tensor, Tensor]:
+def log_evidence(
+    gram: Tensor, values: Tensor, side: Tensor, last: list[Sites] | None = None
+) -> tuple[float, Tensor, Tensor]:
     """Logarithm of the probability of known values and of the rest beyond their levels.
 
     Returns:
@@ -136,6 +143,8 @@ def log_evidence(gram: Tensor, values: Tensor, side: Tensor) -> tuple[float, Ten
         gram: (n, n) covariance with noise.
         values: (n,) known values, or levels.
         side: (n,) 0 where known, 1 below the level, -1 above it.
+        last: stand-ins that were found for similar covariances, the first to begin with; those found now
+            take its place.
     """
     unknown = side != 0
     if not unknown.any():
@@ -144,7 +153,9 @@ def log_evidence(gram: Tensor, values: Tensor, side: Tensor) -> tuple[float, Ten
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
-    sites = propagate(known, values[unknown], side[unknown])
+    sites = propagate(known, values[unknown], side[unknown], last[0] if last else None)
+    if last is not None:
+        last[:] = [sites]
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)

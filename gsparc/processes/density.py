@@ -16,7 +16,7 @@ from scipy.linalg import blas
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.processes.censored import log_evidence
+from gsparc.processes.censored import Sites, log_evidence
 from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, matern_sum, unpacked
 from gsparc.processes.worker import stop_when_late
@@ -77,9 +77,9 @@ class Evidence(torch.autograd.Function):
     """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
-    def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor) -> Tensor:
+    def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor, last: list[Sites]) -> Tensor:
         """See `log_evidence`."""
-        value, slope, weights = log_evidence(gram.detach(), values.detach(), side)
+        value, slope, weights = log_evidence(gram.detach(), values.detach(), side, last)
         ctx.save_for_backward(slope, weights)
         return gram.new_tensor(-value)
 
@@ -87,7 +87,7 @@ class Evidence(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """By the covariance, and by values and levels."""
         slope, weights = ctx.saved_tensors
-        return -slopes[0] * slope, slopes[0] * weights, None
+        return -slopes[0] * slope, slopes[0] * weights, None, None
 
 
 class Profiled(torch.autograd.Function):

@@ -26,6 +26,7 @@ from gsparc.processes.worker import raise_if_cancelled
 ROUNDING = torch.finfo(torch.float32).eps
 RIDGES = (0.01, 0.1, 1.0, 16.0)  # of that bound, tried in turn
 ALONE = 2_000  # rows up to which one thread is as good as several
+BANDS = 4  # of an inverse's rows, that are stored up to its diagonal
 FEW = 128  # rows below which torch is as quick
 # Two threads of OpenBLAS beside other work took 10 to 400 times as long as one.
 BLAS = ThreadpoolController().select(user_api="blas")
@@ -93,6 +94,21 @@ class Factor:
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
         return self._triangular(values, adjoint=False)
 
+    def whitened_rounded(self, values: Tensor) -> Tensor:
+        """The same of values (n, R) by a stored inverse in float32: half the memory to read for few columns.
+
+        Rounding moves its squares by 1e-6 where the noise is a hundredth of the signal's variance.
+        """
+        if len(self.lower) > ALONE or followed(values):
+            return self.whitened(values)
+        single = values.float()
+        return torch.cat([part @ single[: part.shape[1]] for part in self._rounded]).to(values.dtype)
+
+    @cached_property
+    def _rounded(self) -> list[Tensor]:
+        root, step = self._inverted().float(), -(-len(self.lower) // BANDS)
+        return [root[i : i + step, : i + step].contiguous() for i in range(0, len(root), step)]
+
     def solved(self, values: Tensor) -> Tensor:
         """`K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
@@ -112,6 +128,9 @@ class Factor:
     @cached_property
     def root(self) -> Tensor:
         """`L^-1` (..., n, n): `K^-1 = root^H root`."""
+        return self._inverted()
+
+    def _inverted(self) -> Tensor:
         if not _alone(self.lower):
             eye = torch.eye(self.lower.shape[-1], dtype=self.lower.dtype, device=self.lower.device)
             return torch.linalg.solve_triangular(self.lower, eye, upper=False)

@@ -22,10 +22,7 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
 
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
-LEAST_SILENT, MOST_SILENT = (
-    200,
-    3_000,
-)  # of them, where nothing was heard: no more than were heard, but for few
+LEAST_SILENT, MOST_SILENT = 200, 3_000  # silent ones of them: no more than were heard, but for few
 BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 

@@ -20,6 +20,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
 QUERIES = 512  # at a time: memory
+ROUNDED_FROM, ROUNDED = 1e-2, 8  # noise, of the amplitude, and queries of a process, for float32 factors
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Shared:
     Args:
         processes: by number, of one value each; possibly none, of which rows were heard before.
         never: prior of a process without rows, whose trend all have.
-        columns: of places (n, D), (n, P) of the shared terms for unit normal weights, P at least 1.
+        columns: of places (n, D), (n, P) of the shared terms for unit normal weights, possibly none.
         weights: factor of the precision (P, P) of the weights, and their mean (P,); None: of all processes.
     """
 
@@ -85,6 +86,7 @@ class Shared:
     ) -> None:
         self.processes, self.never, self.columns = processes, never, columns
         self._blocks: dict[int, Block] = {}
+        self._weights: dict[int, Tensor] = {}
         self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
 
     def block(self, number: int) -> Block:
@@ -105,7 +107,7 @@ class Shared:
         mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for one in number.unique().tolist():
             for at in (number == one).nonzero()[:, 0].split(QUERIES):
-                said = self._said(queries[at], one, own[at], columns[at])
+                said = self._said(queries[at], one, own[at], columns[at], len(at) <= ROUNDED)
                 mean = mean.index_add(0, at, said.more)
                 prior = said.prior.kernel.amplitude * said.prior.variance(own[at])
                 known = prior if said.white is None else (prior - said.white.square().sum(1)).clamp_min(0.0)
@@ -127,15 +129,24 @@ class Shared:
         mean = self.never.mean(flat)[:, 0] + said.more
         return mean.unflatten(0, groups), left
 
-    def _said(self, queries: Tensor, number: int, own: Tensor, columns: Tensor) -> _Said:
+    def _said(
+        self, queries: Tensor, number: int, own: Tensor, columns: Tensor, rounded: bool = False
+    ) -> _Said:
         """By one process; `own` (B, Q) and `columns` (B, P) are terms at the queries."""
         if number not in self.processes:
             return _Said(self.never, columns @ self.mean, None, self.factor.whitened(columns.T).T)
         block = self.block(number)
         prior = block.process.prior
         cross = deviation_of(prior) * block.process.cross(queries, own)
-        white = block.process.factor.whitened(cross.T).T
-        more = columns @ self.mean + white @ (block.values - block.columns @ self.mean)
+        factor = block.process.factor
+        rounded &= prior.kernel.noise >= ROUNDED_FROM
+        white = (factor.whitened_rounded if rounded else factor.whitened)(cross.T).T
+        if number not in self._weights:
+            rest = (block.values - block.columns @ self.mean)[:, None]
+            self._weights[number] = factor.solved(factor.lower @ rest)[:, 0]
+        more = columns @ self.mean + cross @ self._weights[number]
+        if not len(self.mean):
+            return _Said(prior, more, white, columns)
         return _Said(prior, more, white, self.factor.whitened((columns - white @ block.columns).T).T)
 
     @torch.no_grad()

@@ -11,11 +11,11 @@ import pytest
 from campaigns import compose, powers, spectra
 from PIL import Image
 
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.locator import trust_state
+from gsparc.apps.locate.search import Unknown
 from gsparc.commands.locate import locate
 from gsparc.commands.train import train
-from gsparc.locate.likelihood import Trust
-from gsparc.locate.locator import trust_state
-from gsparc.locate.search import Unknown
 from gsparc.models import checkpoint
 
 UNPLACED = {"x", "y", "z", "area_m2", "modes"}

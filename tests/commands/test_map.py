@@ -17,8 +17,8 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
+from gsparc.apps.maps import map_of
 from gsparc.commands.listing import COMMANDS
-from gsparc.maps import map_of
 
 
 def run(command, *settings, folder):
@@ -47,6 +47,7 @@ def test_every_layer_a_table_and_a_page(mapped):
     facts = json.loads((folder / "summary.json").read_text())
     assert facts["promise/calibrated"] == 1 and 0.8 < facts["promise/held/share"] <= 1
     assert facts["map/stations"] == 2 and "held-out blocks" in said
+    assert f"expected error {facts['map/expected_error_db']:.2f} dB" in said
     with np.load(folder / "map.npz") as found:
         told = np.isfinite(found["power_db"])
         assert found["power_db"].shape == (2, 30, 40) and told.mean() > 0.8
@@ -69,6 +70,8 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     done = run("plan", f"ckpt={model}", "count=6", "route=true", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
     assert any("6 places: expected error" in line and "a walk of" in line for line in done.out), done
+    facts = json.loads((tmp_path / "summary.json").read_text())
+    assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 7 and (tmp_path / "plan.png").exists()
 
 

@@ -11,7 +11,7 @@ from gsparc.__main__ import main
 COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
     "simulate": "needs the ray tracer (tests/simulate)",
     "bench": "measures the machine (tests/prediction/test_bench.py)",
-    "link": "needs Sionna (tests/evaluation/link/test_link.py)",
+    "link": "needs Sionna (tests/apps/link/test_link.py)",
     "report": "needs folders of runs (tests/evaluation/report)",
     "trainer=ddp": "processes of their own (tests/training/test_processes.py)",
     "trainer.devices=2": "processes of their own (tests/training/test_processes.py)",
@@ -26,7 +26,7 @@ COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
 
 def _composed(line: tuple[str, ...]) -> bool:
     text = " ".join(line)
-    served = line[0] in ("serve", "view") and "save=" not in text  # until Ctrl-C (tests/view, test_serve.py)
+    served = line[0] in ("serve", "view") and "save=" not in text  # until Ctrl-C: tests/apps/view
     unfinished = any(word.startswith("ckpt_path") for word in line)  # tests/hard_cases/test_resume.py
     sweep = "experiment=ablation_" in text  # of many trainings
     return (

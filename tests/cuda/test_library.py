@@ -168,16 +168,6 @@ def resources(told: str) -> dict[str, dict[str, int]]:
     return {name: numbers for name, numbers in found.items() if name.startswith("_ZN6gsparc")}
 
 
-def test_resources_are_read_as_ptxas_says_them():
-    told = """ptxas info    : Compiling entry function '_ZN6gsparc4thawEv' for 'sm_90'
-    8 bytes stack frame, 4 bytes spill stores, 4 bytes spill loads
-ptxas info    : Used 56 registers, used 1 barriers, 8 bytes cumulative stack size, 6144 bytes smem
-ptxas info    : Compiling entry function '_ZN3cub4sortEv' for 'sm_90'
-ptxas info    : Used 99 registers"""
-    numbers = {"stack frame": 8, "spill stores": 4, "registers": 56, "smem": 6144}
-    assert resources(told) == {"_ZN6gsparc4thawEv": numbers}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", [pytest.param("75", marks=pytest.mark.rare), "90"])
 def test_compiles(arch, tmp_path, monkeypatch):
@@ -216,8 +206,3 @@ def test_compiles(arch, tmp_path, monkeypatch):
     if shutil.which("ldd"):
         linked = subprocess.run(["ldd", str(path)], capture_output=True, text=True, check=True).stdout
         assert "torch" not in linked and "python" not in linked
-
-
-def test_sources_stay_beside_the_package():
-    found = {Path(unit).stem for unit in cuda_library.cuda_sources()}
-    assert {"plan", "composite", "frozen", "networks", "similarity"} <= found

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from campaigns import compose
-from omegaconf import OmegaConf
 
 import gsparc.conf
 from gsparc.data.datamodule import DataModule, Loaded, StepLoader, order, share, steps_per_epoch
@@ -37,14 +36,6 @@ def test_order_is_pinned():
     """A change here breaks the resuming of every stored run."""
     assert order(0, 0, 4, np.arange(8)).tolist() == [2, 4, 3, 6]
     assert order(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
-
-
-def test_loader_starts_where_it_is_told(data):
-    whole = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
-    rest = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0, first_step=lambda: 2)]
-    assert len(whole) == 3 and rest == whole[2:]
-    second = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0, first_step=lambda: 3)]
-    assert len(second) == 3 and second != whole
 
 
 def test_empty_pool_is_refused(data):
@@ -92,13 +83,6 @@ def test_resume_in_the_middle_of_an_epoch_continues_exactly(data, tmp_path):
         assert resumed.seen == whole.seen[step:], f"resumed at step {step}"
 
 
-def test_resume_from_a_checkpoint_saved_by_hand(data, tmp_path):
-    resumed, module = _Recorder(), Loaded(data, 4).use(FOLD, seed=7)
-    _fit(module, tmp_path, _Recorder(), steps=5).save_checkpoint(tmp_path / "hand.ckpt")
-    _fit(module, tmp_path, resumed, steps=9, ckpt=tmp_path / "hand.ckpt")
-    assert resumed.seen == [order(7, s, 4, FOLD.train).tolist() for s in range(5, 9)]
-
-
 TYPOS = {"rfdi": "rfid", "newerf": "newrf", "rfid-sim": "rfid_sim", "owm": "own"}
 CONFIGS = {path.stem: path for path in Path(gsparc.conf.__path__[0]).joinpath("dataset").glob("*.yaml")}
 del CONFIGS["fingerprints"]  # of `gsparc locate` alone
@@ -114,11 +98,6 @@ def test_every_config_names_a_data_module_of_its_own(name):
     assert type(short) is type(module) and vars(short).keys() == vars(module).keys()
     for key in ("root", "file", "settings", "selection", "stand_in"):
         assert getattr(short, key, None) == getattr(module, key, None)
-
-
-def test_data_modules_are_of_different_classes():
-    made = [OmegaConf.create(path.read_text())["_target_"] for path in CONFIGS.values()]
-    assert len(set(made)) == len(CONFIGS) == 13
 
 
 NO_MODULE = "is no gsparc.data.datamodule.DataModule"

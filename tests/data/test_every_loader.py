@@ -111,14 +111,3 @@ def test_a_place_that_is_none_is_refused_by_row(tmp_path, door, value):
 def test_transposed_places_are_refused(tmp_path, door):
     with pytest.raises(DataError, match=r"transposed\?"):
         read(door, DOORS[door](tmp_path, lambda places: np.array(places).T))
-
-
-@EVERY
-def test_swapped_columns_are_another_room_of_the_same_size(tmp_path, door):
-    """Nothing can tell x from y; what is said shows both, so that a person can."""
-    for name in ("plain", "turned"):
-        (tmp_path / name).mkdir()
-    plain = said(door, DOORS[door](tmp_path / "plain", np.array))["moves"]
-    turned = said(door, DOORS[door](tmp_path / "turned", lambda p: np.array(p)[..., [1, 0, 2]]))["moves"]
-    size = [text.partition("box of ")[2].partition(" m")[0].split(" x ") for text in (plain, turned)]
-    assert size[0] == [size[1][1], size[1][0], size[1][2]]

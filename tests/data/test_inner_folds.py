@@ -63,14 +63,6 @@ def test_they_are_of_training_rows_alone_and_a_pure_function(name):
     assert any(not np.array_equal(a.test, b.test) for a, b in zip(inner.folds, other.folds, strict=True))
 
 
-def test_random_folds_share_no_row_where_they_need_not():
-    positions = floor()
-    _, inner = both("random", positions, 5)
-    tested = np.concatenate([fold.test for fold in inner.folds])
-    assert len(np.unique(tested)) == len(tested) == 480
-    assert [len(fold.test) for fold in inner.folds] == [96] * 5  # a fifth each, as of all rows
-
-
 def test_blocks_are_the_same_squares_of_floor():
     positions = floor()
     outer, inner = both("blocks", positions, share=0.15)
@@ -102,13 +94,6 @@ def test_squares_are_made_smaller_where_two_are_left():
     _, inner = both("blocks", positions, side_m=0.34)
     assert inner.name == "blocks" and len(inner.folds) == 3
     assert all(len(fold.val) and len(fold.test) for fold in inner.folds)
-
-
-def test_stretches_are_as_long_as_the_test_is():
-    walk = np.cumsum(np.random.default_rng(0).normal(size=(500, 3)) * 0.006, axis=0)
-    outer, inner = both("grouped", walk, 4)
-    for fold in inner.folds:
-        assert len(fold.test) == pytest.approx(len(outer.test), rel=0.1)
 
 
 def test_thinned_rows_are_not_thinned_again():

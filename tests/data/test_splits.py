@@ -88,11 +88,6 @@ def test_block_is_a_rectangle_in_a_corner(corner):
     assert depth[rest].min() > depth[fold.test].max() - 0.01
 
 
-def test_sparse_trains_on_a_tenth():
-    fold = make_split(_walk(), SplitSettings("sparse")).folds[0]
-    assert len(fold.train) + len(fold.val) == 40 and len(fold.test) == 360
-
-
 def test_thinned_training_sets_are_nested_and_share_the_test_set():
     def train(**kwargs):
         fold = make_split(_walk(), SplitSettings(**kwargs)).folds[0]
@@ -199,11 +194,6 @@ def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path):
         split_for({"name": "file"}, data)
     with pytest.raises(DataError, match=r"split\.leave_out: row 999 of rows 0 to"):
         split_for({"name": "file", "path": path, "leave_out": [999]}, data)
-
-
-def test_grouped_on_the_real_path_keeps_most_training_rows(real_rfid):
-    split = split_for({"name": "grouped"}, load_rfid(real_rfid))
-    assert all(len(f.train) + len(f.val) > 100 for f in split.folds)
 
 
 def test_thinning_by_distance_leaves_the_test_rows_alone():

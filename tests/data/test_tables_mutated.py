@@ -192,33 +192,14 @@ class Changes:
             names = {h: h.replace("mW", "W").replace("dBm", "dBW") for h in levels + watts}
             return replace(changed, digits=9).renamed(names), SAME
 
-    def a_field_strength(drive, rng):
-        names = {h: h.replace("dBm", "dBuV/m").replace("mW", "V/m") for h in drive.columns}
-        if list(names) != list(names.values()):
-            return drive.renamed(names), REFUSED
-
     def axes_swapped(drive, rng):
         if drive.on_a_map():
             return drive.renamed(SWAPPED), REFUSED
-
-    def axes_swapped_in_the_list(drive, rng):
-        if drive.listed is not None and drive.on_a_map():
-            listed = {SWAPPED.get(head, head): values for head, values in drive.listed.items()}
-            return replace(drive, listed=listed), REFUSED
 
     def a_sign_lost(drive, rng):
         head = str(rng.choice(["lat", "lon", "y"]))
         if head in drive.columns and drive.on_a_map():
             return drive.with_values([head], lambda v: -v), REFUSED
-
-    def another_separator(drive, rng):
-        names = [
-            *drive.columns.get(drive.of_stations(), ()),
-            *(drive.listed or {}).get("name", ()),
-            *drive.columns,
-        ]
-        spaces = [" "] * (not any(" " in name for name in names))
-        return replace(drive, separator=str(rng.choice([";", "\t", "|", *spaces]))), SAME
 
     def another_separator_in_a_line(drive, rng):
         row, other = -1 - int(rng.integers(COUNT)), ";" if drive.separator == "|" else "|"
@@ -238,17 +219,10 @@ class Changes:
             if abs(drive.columns.get(head, [0])[0]) > 1e4:
                 return drive.with_values([head], lambda v: f"{v:,.3f}".translate(marks)), REFUSED
 
-    def a_row_commented_out(drive, rng):
-        row, mark = -1 - int(rng.integers(COUNT)), str(rng.choice(["#", "%", "//", "# "]))
-        return drive.with_line(row, mark + drive.lines()[row]), REFUSED
-
     def a_comment_among_rows(drive, rng):
         row = -1 - int(rng.integers(COUNT))
         text = drive.separator.join(["# turned", "back", "here", "and", "there"][: int(rng.integers(1, 6))])
         return drive.with_line(row, text, drive.lines()[row]), EITHER
-
-    def the_mark_before_heads(drive, rng):
-        return replace(drive, comment="" if drive.comment else "# "), SAME
 
     def a_sign_in_a_head(drive, rng):
         heads = [h for h in drive.columns if h[:4] in ("csi_", "h re", "h im") and h[-1] in "123456789"]
@@ -280,18 +254,9 @@ class Changes:
             numbers = [str(drive.listed["name"].index(name)) for name in drive.columns[head]]
             return replace(drive, columns={**drive.columns, head: numbers}), REFUSED
 
-    def a_line_cut_short(drive, rng):
-        row = -1 - int(rng.integers(COUNT))
-        return drive.with_line(row, drive.lines()[row].rpartition(drive.separator)[0]), REFUSED
-
     def two_lines_in_one(drive, rng):
         row, lines = -1 - int(rng.integers(COUNT - 1)), drive.lines()
         return replace(drive.with_line(row, lines[row] + lines[row])), REFUSED
-
-    def a_place_missing(drive, rng):
-        head, row = next(h for h in drive.columns if h in SWAPPED), int(rng.integers(COUNT))
-        gone = [None if i == row else value for i, value in enumerate(drive.columns[head])]
-        return replace(drive, columns={**drive.columns, head: gone}), REFUSED
 
     def other_heads(drive, rng):
         names = {"lat": "Latitude (deg)", "lon": "GPS_Longitude", "x": "X [m]", "y": "Y_m", "z": "Height (m)"}
@@ -312,16 +277,6 @@ class Changes:
     def a_second_level(drive, rng):
         if not drive.said:
             return replace(drive, columns={"RSSI strongest": [-50.0] * COUNT, **drive.columns}), REFUSED
-
-    def empty_lines(drive, rng):
-        lines = drive.lines()
-        return replace(drive, changed=(*lines[:-3], "", drive.separator * 3, *lines[-3:], "", "")), SAME
-
-    def a_trailing_separator(drive, rng):
-        first = len(drive.above) + 1
-        lines = [line + drive.separator * (i >= first) for i, line in enumerate(drive.lines())]
-        if drive.separator != " ":
-            return replace(drive, changed=tuple(lines)), EITHER
 
 
 CHANGES = [change for name, change in vars(Changes).items() if not name.startswith("_")]

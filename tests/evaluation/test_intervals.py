@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.intervals import levels, power_intervals
+from gsparc.evaluation.intervals import levels, power_intervals, with_silent
 from gsparc.evaluation.scores import Scores
 
 COUNT, LEVEL = 4000, -80.0
@@ -53,6 +55,26 @@ def test_too_sure_and_too_unsure_are_told_apart(drawn):
     sure, right, unsure = (power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0))
     assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
     assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
+
+
+def test_silent_rows_counted_nowhere(drawn):
+    """Beside lists of the strongest methods that predict what was heard everywhere had the better rmse."""
+    data, mean_db = drawn
+    heard, level = data.side(np.arange(COUNT)) == 0, 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    lifted = np.maximum(mean_db, LEVEL + 6)  # as if every place heard
+    honest, other = (
+        {"error_db": said - level, **scored(data, said, 6.0).samples} for said in (mean_db, lifted)
+    )
+    squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
+    both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
+    found = [with_silent(one, data)["rmse_db_with_silent"] for one in both]
+    assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
+
+
+def test_levels_of_lists_are_none_of_a_station(drawn):
+    """The last list's level was taken for the sensitivity of a station."""
+    data = replace(drawn[0], target=drawn[0].target * np.linspace(1, 2, COUNT, dtype=np.float32)[:, None])
+    assert np.isnan(levels(data)).all()
 
 
 def test_no_variance_no_figures(drawn):

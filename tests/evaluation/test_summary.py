@@ -19,7 +19,6 @@ from gsparc.evaluation.summary import (
     program,
     provenance,
     remarks,
-    result_rows,
     results_table,
     write_samples,
     write_summary,
@@ -110,9 +109,3 @@ def test_rows_that_were_learned_from_were_shown_like_unseen_ones(prefix):
 def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
     assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program({"git": None}))
     assert program({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")
-
-
-def test_a_run_of_a_baseline_had_two_rows_of_one_name():
-    facts = {"dataset/kind": "csi", "test/nmse": 0.2, "baseline/gp/nmse": 0.1, "baseline/idw/nmse": 0.3}
-    assert [row[0] for row in result_rows(facts, "gp")[1]] == ["idw", "gp (baseline)", "gp"]
-    assert "the baseline gp has the better nmse" in remarks(facts)[-1]

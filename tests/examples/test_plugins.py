@@ -21,7 +21,6 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.experiment import done
 from gsparc.evaluation.experiment.cells import plugged
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
@@ -50,10 +49,6 @@ def installed(tmp_path, monkeypatch):
     for group in ("model", "dataset"):
         ConfigStore.instance().repo[group] = {**ConfigStore.instance().repo.get(group, {})}
     return install
-
-
-def test_the_template_is_short():
-    assert len((EXAMPLES / "own-method" / "own_method.py").read_text().splitlines()) < 60
 
 
 def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
@@ -105,21 +100,6 @@ def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):
         build({"_target_": "own_method.NearestK"}, trusted=False)
     with pytest.raises(ValueError, match="no method is called 'nearest_k'"):
         method_class("nearest_k")
-
-
-def test_another_text_of_a_plugin_is_another_method(installed, tmp_path, monkeypatch):
-    """A kept result of a comparison is not taken for that of changed code."""
-    (tmp_path / "my_plugin").mkdir()
-    (tmp_path / "my_plugin" / "__init__.py").write_text("")
-    file = tmp_path / "my_plugin" / "method.py"
-    monkeypatch.syspath_prepend(str(tmp_path))
-    before = []
-    for number in (1, 22):
-        file.write_text(f"class Own:\n    depth = {number}\n")
-        importlib.invalidate_caches()
-        done._program.cache_clear()
-        before.append(done.program({"model": {"_target_": "my_plugin.method.Own"}}))
-    assert before[0] != before[1]
 
 
 def test_a_broken_plugin_is_warned_of(installed, tmp_path):

@@ -21,13 +21,6 @@ def test_the_best_confidence_is_alpha_over_loss():
     assert weighted(torch.tensor(0.5), g, 0.3).argmin() == 0
 
 
-def test_the_exponent_stays_within_the_clamp():
-    sure = confidence(clamp=2.0)
-    with torch.no_grad():
-        sure.network[2].bias.fill_(1e6)
-    assert torch.equal(sure.exponent(torch.rand(3, 3)), torch.full((3,), 2.0))
-
-
 def test_the_range_comes_from_calibration_and_is_not_moved_by_queries():
     sure = confidence()
     calibration = torch.rand(50, 3)

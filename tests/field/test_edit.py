@@ -24,13 +24,6 @@ def stepped(root: Root) -> torch.optim.Adam:
     return optimizer
 
 
-def test_only_rows_of_gaussians_are_edited():
-    names = set(row_parameters(Root(), 6))
-    assert names == {f"gaussians.{n}" for n in ("means", "log_scales", "quats", "opacity_logits")} | {
-        "head.weight"
-    }
-
-
 def test_one_edit_moves_everything_together():
     root = Root()
     optimizer = stepped(root)
@@ -52,17 +45,6 @@ def test_one_edit_moves_everything_together():
     assert int(root.gaussians.version) == 1 and root.shared is shared
     held = {id(group["params"][0]) for group in optimizer.param_groups}
     assert held == {id(p) for p in root.parameters()} and len(optimizer.state) == len(held)
-
-
-def test_the_optimizer_goes_on_after_an_edit():
-    root = Root()
-    optimizer = stepped(root)
-    edit.apply(Edit(torch.tensor([True] * 5 + [False]), torch.tensor([0])), root, root.gaussians, optimizer)
-    before = root.gaussians.means.detach().clone()
-    optimizer.zero_grad()
-    sum(p.square().sum() for p in root.parameters()).backward()
-    optimizer.step()
-    assert (root.gaussians.means != before).any(0).all() and root.gaussians.means.isfinite().all()
 
 
 def test_an_edit_before_the_first_step_has_no_moments_to_move():

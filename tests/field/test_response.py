@@ -1,35 +1,21 @@
 """From emissions to measurements: factored channels, splat then A; end to end."""
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from campaigns import RENDERED, compose
-from campaigns import channels as channel_file
-from contexts import short
 from known_arrays import array_site, spectra
 from torch import Tensor
 
 from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.load import load as load_data
-from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view, seen_by_array
 from gsparc.field.response import ArrayResponse, ChannelResponse
-from gsparc.models.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
 from gsparc.simulate.shoebox import LIGHT
 
 GRID = SphereGrid.hemisphere(8, 16)
-
-
-def trained(data, fold, folder, *overrides: str, steps: int = 30):
-    """`model=gsparc` with overrides, trained for a moment."""
-    method = build(compose("logger=none", *overrides).model)
-    context = short(folder, steps, 16, validate_every=steps)
-    return method, method.fit(data, fold, context)
 
 
 # ---- factored channels ----
@@ -55,29 +41,6 @@ def test_one_channel_learns_no_delay():
     assert not response.delays.requires_grad
     gains = torch.randn(2, 4, dtype=torch.complex64)
     torch.testing.assert_close(response(gains)[:, 0, 0], gains.sum(1))
-
-
-@pytest.mark.slow
-def test_1664_channels_cost_no_more_than_twice_one(tmp_path):
-    """64 antennas x 26 subcarriers through the whole model; the quicker of interleaved rounds."""
-    data = load_data({"name": "own", "file": str(channel_file(tmp_path / "own.npz"))})
-    calls = {}
-    for name, shape in (("one", (1, 1)), ("many", (64, 26))):
-        target = np.zeros((len(data), *shape), np.complex64)
-        tones = 2.4e9 + 3e5 * np.arange(shape[1])
-        wide = replace(data, target=target, site=replace(data.site, subcarriers_hz=tones, array=None))
-        fold = Fold(np.arange(40), np.arange(40, 50), np.arange(50, 80))
-        quiet = [*RENDERED, "model.refit=false"]
-        method, _ = trained(wide, fold, tmp_path / name, *quiet, steps=1)
-        calls[name] = (method, wide.batch(np.array([60])))
-    times = {name: [] for name in calls}
-    for _ in range(40):
-        for name, (method, batch) in calls.items():
-            begin = time.perf_counter()
-            method.predict(batch)
-            times[name].append(time.perf_counter() - begin)
-    many, one = (np.quantile(times[name], 0.2) for name in ("many", "one"))
-    assert many <= 2 * one
 
 
 # ---- splat, then A ----

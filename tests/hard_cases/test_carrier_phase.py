@@ -37,14 +37,6 @@ def test_ten_kilometres_at_60_ghz_within_a_thousandth_of_a_radian():
     assert _apart(naive.double().numpy(), exact).max() > 0.1
 
 
-def test_from_positions_through_the_wave():
-    observer = torch.tensor([[0.0, 0.0, 1.5]], dtype=torch.float64)
-    source = torch.tensor([[6_000.0, 8_000.0, 1.5]], dtype=torch.float64)
-    value = wave(ranges(observer, source), CARRIER)[0, 0]
-    assert abs(value.abs().item() * 10_000 - 1) < 1e-6
-    assert _apart(np.array(value.angle().item()), np.array(_exact(10_000.0, CARRIER))) < 1e-3
-
-
 def test_backward_is_the_slope_of_the_unreduced_phase():
     source = torch.tensor([[6_000.0, 8_000.0, 0.0]], dtype=torch.float64, requires_grad=True)
     phase = reduced_phase(ranges(torch.zeros(1, 3), source), CARRIER)

@@ -43,15 +43,6 @@ def test_right_inside_the_clamp(g):
     assert torch.allclose(got, c * loss.double() - 0.3 * c.log(), atol=float(1e-6 * (1 + c[0]) * 10))
 
 
-def test_the_whole_range_is_stored_and_normalises():
-    sure = Confidence(ConfidenceSettings(), PositionEncoding(EncodingSettings("raw"), BOX))
-    with torch.no_grad():
-        sure.network[0].weight.mul_(1e6)
-    sure.calibrate(torch.randn(50, 3))
-    said = sure.normalised(torch.randn(50, 3))
-    assert ((said >= 0) & (said <= 1)).all()
-
-
 def test_clipping_after_the_exponential_breaks():
     """Naive: C = (1 + exp(g)).clamp(max=1e4)."""
     g = torch.tensor([100.0], requires_grad=True)

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from campaigns import brief, spectra
-from crashes import Limited, run, simulation, training
+from crashes import Limited, run, simulation
 
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
@@ -51,21 +50,6 @@ def test_no_space_is_said_so(fitted, tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match=r"m\.ckpt: cannot be written \(No space left on device\)"):
         checkpoint.save(tmp_path / "m.ckpt", fitted)
     assert left(tmp_path) == []
-
-
-@pytest.mark.slow
-def test_training_stops_with_one_line_and_goes_on_when_there_is_room(tmp_path):
-    settings = brief(spectra(tmp_path / "own.npz"), "callbacks.checkpoint.interval=5", "model.refit=false")
-    folder = tmp_path / "run"
-    assert run(training, str(folder), settings)[0] == 0
-    good, size = (folder / "last.ckpt").read_bytes(), (folder / "last.ckpt").stat().st_size
-    code, _ = run(training, str(folder), [*settings, "trainer.max_steps=40"], size // 2)
-    said = (folder / "error.txt").read_text()
-    assert code == 1 and "last.ckpt: cannot be written (" in said and "\n" not in said, said
-    assert (folder / "last.ckpt").read_bytes() == good
-    on = [*settings, "trainer.max_steps=40", f"ckpt_path={folder / 'last.ckpt'}"]
-    assert run(training, str(folder), on)[0] == 0
-    assert checkpoint.read(folder / "last.ckpt").extra["trainer"]["global_step"] == 40
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasters import PROJECTIONS, assert_equals_float64, origin, poses, random_scene, render
+from rasters import PROJECTIONS, origin, poses, random_scene, render
 
 from gsparc.ops import Cutoff, SphereGrid, freeze, make_plan, mean_weights
 
@@ -28,10 +28,6 @@ def test_no_gaussians(backend, projection, hides, count):
     got = render(scene, poses(count), GRID, backend, projection=projection)
     assert got["image"].shape == (3, 2, 10, 20) and got["d_means"].shape == (0, 3)
     assert_nothing_is_seen(got)
-
-
-def test_equals_float64(backend):
-    assert_equals_float64(random_scene(n=0), poses(0), GRID, backend)
 
 
 def below_the_horizon():

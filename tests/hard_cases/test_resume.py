@@ -33,12 +33,6 @@ def cut(undisturbed, tmp_path_factory) -> Path:
     return left
 
 
-def test_killed_between_two_densifications(undisturbed, cut, tmp_path):
-    folder, settings, _ = undisturbed
-    assert run(training, str(tmp_path), [*settings, f"ckpt_path={cut}"])[0] == 0
-    assert_same(folder, tmp_path)
-
-
 @pytest.mark.parametrize("forgetful", [False, True])
 def test_a_checkpoint_of_parameters_and_moments_alone_breaks(undisturbed, cut, tmp_path, forgetful):
     """Naive: what was gathered since the last densification is forgotten."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.locate.fingerprints.rows import Fingerprints
+from gsparc.data.datasets.fingerprints import Fingerprints
 
 
 def invented(count: int, floors: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

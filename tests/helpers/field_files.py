@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 
-from gsparc.prediction.compiled.blob import CHECKED, HEAD, SECTION, Form, packed
+from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, packed
 
 COMMON = 6  # numbers before those of the form
 SIZES = {

@@ -12,7 +12,6 @@ from gsparc.data.own import from_arrays, load_own
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.conditional import ConditionalField
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace
 
@@ -79,8 +78,7 @@ def answer_error(model, data: Measurements, rows: np.ndarray) -> float:
     """The same of a method's or a field's answers to rows, in the phase of their runs."""
     batch = data.batch(rows)
     with torch.no_grad():
-        answer = model(batch) if isinstance(model, ConditionalField) else model.predict(batch)
-    return _share(answer.mean, batch.target)
+        return _share(model.predict(batch).mean, batch.target)
 
 
 def _share(mean: torch.Tensor, target: torch.Tensor) -> float:

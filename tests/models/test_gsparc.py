@@ -21,12 +21,12 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, fields, loading
+from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
-from gsparc.models.mixture import solutions
+from gsparc.models.mixture import residual, solutions
 from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.registry import build, method_class
 from gsparc.models.splat.averaged import ImageProcess
@@ -215,22 +215,23 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
-    monkeypatch.setattr(fields, "LEAST_GAIN", -math.inf)
+    monkeypatch.setattr(residual, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(race, "HOPELESS", math.inf)
     monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
-    field = fitted.method.field
-    assert isinstance(field, Mixture) and sum(field.weights) == pytest.approx(1)
-    assert [isinstance(member, Mixture) for member in field.members] == [False, True, True]
+    field = fitted.method.chosen
+    assert sum(field.weights) == pytest.approx(1)
+    completed = [isinstance(member, Residual) and member.rest is not None for member in field.members]
+    assert completed == [False, True, True]
     assert fitted.method.facts()["model/init"] == "diffuse+few sources+sources" and field.count
     assert {"phase", "residual"} <= set(fitted.method.effects.split("+"))
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert isinstance(again.field, Mixture) and again.field.weights == field.weights
+    assert again.chosen.weights == field.weights
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
-    again.field.condition(fitted.data, rows)  # the same rows, the same weights
+    again.chosen.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
     one, two = (m.predict(batch).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
@@ -276,9 +277,9 @@ def test_without_the_residual_gaussians_are_alone(name):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
-    found = method.field(batch)
+    found = method.chosen.predict(batch)
     torch.testing.assert_close(found.mean, found.explained)
-    assert not isinstance(method.field, Mixture)
+    assert not isinstance(method.only, Residual)
 
 
 @pytest.mark.parametrize(
@@ -317,7 +318,7 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
     given = []
     initialiser = lambda *args: given.append(args[-1].budget_s) or 1 / 0  # noqa: E731
-    monkeypatch.setattr(solutions, "INITIALISERS", {"powers": initialiser})
+    monkeypatch.setattr(solutions, "CANDIDATES", {"powers": initialiser})
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):

@@ -33,11 +33,16 @@ def test_powers_of_one_law_are_learned_together():
 @pytest.mark.parametrize(("wrong_db", "best"), [({"joint_powers": 2, "powers": 1}, "each"),
                                                 ({"joint_powers": 1, "powers": 2}, "together")])  # fmt: skip
 def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best):
-    def initialiser(name):
-        answer = lambda batch: SimpleNamespace(mean=batch.target * 10 ** (wrong_db[name] / 10))  # noqa: E731
-        return lambda *given: (answer, None)
+    def wrong(name):
+        class Wrong:
+            fit = predict = lambda self, batch, *rest: SimpleNamespace(
+                mean=getattr(batch, "target", 0) * 10 ** (wrong_db[name] / 10)
+            )
 
-    monkeypatch.setattr(stations, "INITIALISERS", {name: initialiser(name) for name in wrong_db})
+        return lambda **settings: Wrong()
+
+    monkeypatch.setattr(stations, "JointPowerField", wrong("joint_powers"))
+    monkeypatch.setattr(stations, "PowerField", wrong("powers"))
     how, why = stations.best(*of_one_law(), FitContext(budget_s=60))
     said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
     assert how == best and said in why and "3 folds" in why

@@ -8,7 +8,6 @@ from gsparc.ops import BackendUnavailable, SphereGrid, StalePlan, composite, fre
 from gsparc.ops.geometry import WIDEST_GRID
 
 GRID = GRIDS["hemisphere"]
-BACKENDS = pytest.mark.parametrize("backend", ["cpu", "reference"])
 
 
 def test_the_widest_grid_is_drawn_to_its_last_column():
@@ -26,28 +25,6 @@ def test_absent_backends_say_why():
         make_plan(*scene.model, poses(0), GRID, backend="cuda")
     with pytest.raises(ValueError, match="backend is"):
         make_plan(*scene.model, poses(0), GRID, backend="tpu")
-
-
-@BACKENDS
-def test_shared_features_many_poses(backend):
-    scene, pose = random_scene(samples=1), poses(3)
-    one, each = (
-        rasterize(*scene.model, features, pose, GRID, backend=backend).image
-        for features in (scene.features[0], scene.features.expand(3, -1, -1))
-    )
-    assert one.shape == (3, 2, 30, 120) and torch.equal(one, each)
-
-
-@BACKENDS
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_frozen_view_renders_the_same(backend, dtype):
-    scene, pose = random_scene(hides=True).to(dtype), poses(0)
-    hidden = {"extinctions": scene.extinctions}
-    plan = make_plan(*scene.model, pose, GRID, **hidden, backend=backend)
-    frozen = freeze(plan, *scene.model, **hidden, version=3)
-    want = composite(plan, *scene.model, scene.features, **hidden).image
-    assert torch.allclose(frozen.render(scene.features, version=3), want, atol=1e-5)
-    assert torch.allclose(frozen.render(scene.features[0], version=3), want[0], atol=1e-5)
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 19])

@@ -28,11 +28,6 @@ def test_squared_spectrum_is_linear_in_the_lags(array):
     torch.testing.assert_close(numbers @ lags.basis(grid, WAVELENGTH).T, direct)
 
 
-def test_a_square_array_has_49_lags():
-    assert len(array_response.lags(planar_array(), WAVELENGTH).forms()) == 49
-    assert len(array_response.lags(planar_array(2, 3), WAVELENGTH).forms()) == 15
-
-
 def test_array_output_is_the_weighted_sum_over_directions():
     grid, array = SphereGrid.hemisphere(4, 6), planar_array(2, 2)
     z = _vectors(1, 24).view(1, 4, 6)

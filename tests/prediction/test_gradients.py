@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from campaigns import RENDERED, compose, spectra
+from closed import fitted_to
 from contexts import short
 from rooms import directed, shoebox
 from torch.autograd import forward_ad
@@ -23,13 +24,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines import gp
 from gsparc.models.channels import complex_gp
-from gsparc.models.channels.initial import ChannelSettings, initialise
-from gsparc.models.closed_forms import Powers
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.initial import ChannelSettings
+from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.source_field import SourceField
 from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.moving_array.bearing_field import BearingField
+from gsparc.models.mixture.named import Powers
+from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.per_station import for_links
@@ -90,21 +91,23 @@ def planned(*more: str) -> Callable[[], Method]:
 
 
 class Assembled(Powers):
-    """A field of what `method` found, with two fields of waves beside it where it is one of channels."""
+    """What `method` found, with two processes of waves beside it where it is one of channels."""
 
-    def __init__(self, method: Method) -> None:
+    def __init__(self, method: ClosedForm) -> None:
         super().__init__()
         self.method = method
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         self.site, report = data.site, self.method.fit(data, fold, context)
-        if isinstance(self.method, MovingArrayField):
-            self.field = BearingField(self.method)
-            return report
-        waves = [initialise(data, fold.train, ChannelSettings(direct=direct))[0] for direct in (True, False)]
-        for field in waves:
-            field.condition(data, fold.train)
-        self.field = Mixture([SourceField(self.method), waves[0]], (0.6, 0.4), waves[1], 0.3)
+        self.members, self.weights = [self.method], (1.0,)
+        if not isinstance(self.method, MovingArrayField):
+            waves = [
+                fitted_to(ChannelField(ChannelSettings(direct=direct)), data, fold.train)[0]
+                for direct in (True, False)
+            ]
+            sources = Residual(self.method)
+            sources.site, sources.rest, sources.share = data.site, waves[1], 0.3
+            self.members, self.weights = [sources, waves[0]], (0.6, 0.4)
         return report
 
 

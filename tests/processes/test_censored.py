@@ -46,6 +46,21 @@ def test_evidence_and_means_are_those_of_sampling(side):
     assert np.allclose(told.mean + told.covariance @ weights, drawn.mean(0), atol=0.05)
 
 
+def test_stand_ins_of_a_similar_vector_are_a_start(monkeypatch):
+    gram, values, unknown = small_vector()
+    sides, last = unknown.to(torch.int8), []
+    log_evidence(1.1 * gram, values, sides, last)
+    found = log_evidence(gram, values, sides, last)
+    alone, calls = log_evidence(gram, values, sides), []
+    assert found[0] == pytest.approx(alone[0], abs=1e-3) and torch.allclose(found[1], alone[1], atol=1e-3)
+    sweep = censored._sites
+    monkeypatch.setattr(censored, "_sites", lambda *given: calls.append(1) or sweep(*given))
+    log_evidence(gram, values, sides, last)
+    again = len(calls)
+    log_evidence(gram, values, sides)
+    assert again <= 2 < len(calls) - again
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_the_slope_of_the_evidence(monkeypatch, side):
     monkeypatch.setattr(censored, "SETTLED", 1e-10)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsparc.simulate import auto
-from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
+from gsparc.simulate.attribution import Deliverable, Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.deciding import Decision, Traced, pays
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, PropagationEffects
@@ -193,15 +193,6 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
     assert probe.nmse(FULL.without("specular"))[0] == pytest.approx(0.01 / abs(h) ** 2, rel=1e-4)
     assert probe.shares(FULL.without("specular"))[0] == pytest.approx(0.01 / 1.01, rel=1e-4)
     assert probe.nmse(FULL)[0] == 0.0
-
-
-def test_removals_and_combinations_are_complete():
-    found = removals(PropagationEffects(depth=3))
-    assert set(found) == {"line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction",
-                          "diffuse", "depth > 2", "depth > 1", "polarisation"}  # fmt: skip
-    assert found["depth > 1"].depth == 1
-    sets = combinations(PropagationEffects(depth=3), ("diffuse", "depth > 2", "polarisation"))
-    assert len(sets) == 8 and sets[0] == PropagationEffects(depth=3)
 
 
 def test_decision_survives_its_file():

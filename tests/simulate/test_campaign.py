@@ -1,16 +1,12 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
 import json
-import os
 import shutil
-import signal
-import sys
 import time
 import tracemalloc
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-import cloudpickle
 import h5py
 import numpy as np
 import pytest
@@ -216,13 +212,6 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     floor_plan(outcome, tmp_path / "plan.png")
 
 
-def test_walk_has_times(tmp_path):
-    walk = {"kind": "trajectory", "points_m": [[0.5, 0.5], [5.5, 0.5]], "speed_m_s": 1.0, "every_s": 0.2}
-    simulate(plan(scene=replace(SCENE, receivers=walk), shard=26), tmp_path / "walk.h5")
-    stored, _ = arrays(tmp_path / "walk.h5")
-    np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)
-
-
 def test_parts_of_another_simulation_are_refused(tmp_path):
     """Of other settings, or of another table of places: shards are kept by the number of a row."""
     table, out = tmp_path / "places.csv", tmp_path / "box.h5"
@@ -329,13 +318,6 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     assert "90,000 rays" in verdict(outcome.choice) and figures(outcome)["auto/samples"] == 90_000
 
 
-def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
-    outcome = simulate(plan(effects=with_rays(monkeypatch, 1.2)), tmp_path / "box.h5")
-    row = outcome.choice.table[-1]
-    assert outcome.choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
-    assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
-
-
 def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     """A run said NOT MET and simulated the choice all the same."""
     real, full = deciding.auto.verify, replace(MIRROR, depth=4)
@@ -422,31 +404,3 @@ def test_bad_scenes_are_refused(tmp_path, changes, words):
         simulate(plan(scene=SceneSettings(**{**vars(SCENE), **changes})), tmp_path / "box.h5")
     assert "\n" not in str(raised.value)
     assert not list(tmp_path.iterdir())
-
-
-@dataclass
-class Counted(campaigns._Tracing):
-    """Writes beside the file which shards are traced; the process of the third ends, once."""
-
-    def __call__(self, shard):
-        begun, killed = (self.shards.out.with_name(name) for name in ("begun", "killed"))
-        if not self.shards.path(shard[0]).exists():
-            with begun.open("a") as file:
-                file.write(f"{shard[0]}\n")
-        if shard[0] == 3 and not killed.exists():
-            killed.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().__call__(shard)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["joblib", "ray"])
-def test_workers_share_shards_and_one_is_killed(tmp_path, monkeypatch, engine, elsewhere):
-    simulate(plan(shard=8), tmp_path / "whole.h5")
-    monkeypatch.setattr(campaigns, "_Tracing", Counted)
-    cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    elsewhere(engine)
-    simulate(plan(shard=8), tmp_path / "shared.h5")
-    begun = (tmp_path / "begun").read_text().split()
-    assert (tmp_path / "killed").exists() and set(begun) == set("12345678") and len(begun) <= 10
-    assert_same(tmp_path / "whole.h5", tmp_path / "shared.h5")

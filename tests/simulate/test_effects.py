@@ -54,12 +54,6 @@ def test_receivers_that_lose_everything_stay():
     assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
 
 
-def test_one_polarisation_is_the_first_port():
-    found = paths_of([0], [0], ports=2)
-    assert found.received_power()[0] == 2.0
-    assert found.under(PropagationEffects(polarisation=False)).received_power()[0] == 1.0
-
-
 def test_delay_spread_of_two_equal_paths():
     found = paths_of([0, SPECULAR], [0, 1])
     assert found.delay_spread()[0] == pytest.approx(0.5e-9)

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
-from shoeboxes import as_arrays, scatter
+from shoeboxes import scatter
 
-from gsparc.data.own import from_arrays, load_own, write_own
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.shoebox import Room, images, trace, visible
 
@@ -95,19 +94,6 @@ def test_noise_level_and_seed():
     ratio = np.mean(np.abs(clean.csi) ** 2) / np.mean(np.abs(noisy.csi - clean.csi) ** 2)
     assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.7)
     np.testing.assert_array_equal(noisy.csi, trace(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1).csi)
-
-
-def test_truth_travels_with_the_file(tmp_path):
-    room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
-    traced = trace(
-        room, np.array([0.0, 1, 1]), scatter(room, 30, seed=6), np.array([2.4e9, 2.42e9]), snr_db=30
-    )
-    data = write_own(tmp_path / "box.h5", as_arrays(traced), {"name": "shoebox"})
-    assert load_own(tmp_path / "box.h5").site.sha256 == data.site.sha256
-    assert data.site.static_end == "tx" and data.target.shape == (30, 1, 2)
-    np.testing.assert_allclose(data.target * data.site.target_scale, traced.csi, rtol=1e-5)
-    moving_tx = trace(room, scatter(room, 30, seed=6), np.array([0.0, 1, 1]), 2.4e9)
-    assert from_arrays(as_arrays(moving_tx)).site.static_end == "rx"
 
 
 def test_positions_outside_are_refused():

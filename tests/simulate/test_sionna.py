@@ -1,11 +1,6 @@
 """The ray tracer for real; slow; skipped with its remedy where Sionna is not installed (`make sionna`)."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from campaigns import compose
 
-from gsparc.commands import simulate as commands
 from gsparc.data.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.auto import AutoSettings
@@ -23,7 +16,7 @@ from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, PropagationEffects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import SceneSettings, build, from_config
-from gsparc.simulate.scenes.conference import SIZE, conference_room
+from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.receivers import clear_of, place
 from gsparc.simulate.scenes.shipped import settings
 from gsparc.simulate.settings import Campaign
@@ -195,32 +188,6 @@ def test_polarisation_edges_and_scattering_are_recorded(room, places):
     assert (paths.order[paths.mechanisms == 0] == 0).all() and paths.order.max() == 2
 
 
-def test_receivers_keep_out_of_objects():
-    solids = conference_room()
-    places = place(2000, np.array(CONFERENCE.area_m), (0.1, 2.0), clear_of(solids), seed=1)
-    for solid in solids:
-        if solid.keep_out is not None:
-            low, high = solid.keep_out
-            assert not np.all((places > low) & (places < high), axis=1).any(), solid.name
-    assert (places > 0).all() and (places < SIZE).all()
-
-
-def test_shipped_materials_scatter_and_receivers_are_outdoors():
-    canyon = SceneSettings(
-        name="canyon", builtin="simple_street_canyon", transmitter_m=(-33, 0, 12), height_m=(1.2, 1.8),
-        area_m=((-60, -45), (60, 45)), num_receivers=30, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=4,
-        open_sky=True,
-    )  # fmt: skip
-    survey = build(canyon, QUICK)
-    engine, receivers = survey.engine, survey.places
-    assert all(m["scattering"] > 0 for m in engine.materials().values())
-    assert engine.under_open_sky(receivers).all()
-    inside = np.array([[45.0, 20.0, 1.5]])  # a building of the scene
-    assert not engine.under_open_sky(inside).any()
-    with pytest.raises(ValueError, match=r"there are .*munich"):
-        build(replace(canyon, builtin="muenchen"), QUICK)
-
-
 def test_shipped_scene_needs_only_its_name():
     """Area, transmitter and sky are found; materials scatter; nobody stands on roofs."""
     city = from_config({**settings("etoile"), "num_receivers": 30})
@@ -286,33 +253,3 @@ def test_auto_in_the_conference_room(tmp_path):
         assert "itu-glass" in json.loads(file.attrs["materials"])
     spectra = load({"name": "sionna", "file": str(tmp_path / "room.h5")})
     assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)
-
-
-def test_killed_run_is_resumed(tmp_path, monkeypatch, caplog):
-    """SIGKILL between shards of two transmitters: nothing finished is lost, every pair is made once."""
-    out = tmp_path / "room.h5"
-    given = [
-        "scene=conference_room", "effects=los", "scene.num_receivers=30", "scene.transmitter_m=null",
-        "scene.transmitters=[{name: a, position_m: [3.1, 6.2, 3.7]}, {name: b, position_m: [11, 3, 3.5]}]",
-        "sampling.samples=5000", "shard=2", "check=0", "spectrum.height=18", "spectrum.width=36",
-        f"out={out}",
-    ]  # fmt: skip
-    command = [sys.executable, "-m", "gsparc", "simulate", *given, f"hydra.run.dir={tmp_path / 'run'}"]
-    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    parts, limit = tmp_path / "room.h5.parts", time.monotonic() + 240
-    while len(list(parts.glob("shard_*.npz"))) < 3:
-        assert running.poll() is None and time.monotonic() < limit
-        time.sleep(0.01)
-    os.kill(running.pid, signal.SIGKILL)
-    running.wait()
-    assert not out.exists()
-    before = {p.name: (p.stat().st_mtime_ns, p.stat().st_ino) for p in parts.glob("shard_*.npz")}
-    monkeypatch.setattr(commands, "run_directory", lambda: tmp_path)
-    with caplog.at_level("INFO"):
-        commands.task(compose(*given, config="simulate"))
-    assert f"{len(before)} of 30 shards are there already" in caplog.text
-    with h5py.File(out) as file:
-        rows = np.column_stack([file["station"][()], file["rx_position"][()]])
-        assert len(np.unique(rows, axis=0)) == 60 and len(file["spectrum"]) == 60
-    facts = json.loads((tmp_path / "summary.json").read_text())
-    assert facts["dataset/receivers"] == 30 and facts["dataset/rows"] == 60

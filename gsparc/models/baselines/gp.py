@@ -17,6 +17,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
+from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
@@ -100,7 +101,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
 
 
-class GaussianProcess(Differentiable):
+class GaussianProcess(Differentiable, ClosedForm, kind="process"):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
@@ -115,6 +116,7 @@ class GaussianProcess(Differentiable):
     stored = ("mean", "axes", "lost")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
+    count = 0  # type: ignore[assignment]
     powers: PowerProcess | None = None  # None: not powers
     scores: Posterior | None = None  # of what is not
 

@@ -1,4 +1,4 @@
-"""A channel's Gaussian field in closed form, conditioned on measured rows."""
+"""Channels of one static end or several as a Gaussian process of waves, conditioned on measured rows."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
+from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import Group, Slot, gather, query_ends, run_factors_of, static_place
 from gsparc.models.channels.common import Common
 from gsparc.models.channels.covariance import (
@@ -26,12 +27,14 @@ from gsparc.models.channels.covariance import (
     signals,
     specular,
 )
-from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.channels.initial import ChannelSettings, find_terms
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.training.context import FitContext, FitReport
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
@@ -78,32 +81,52 @@ class Weights:
         return (cross.conj() @ self.root.T).abs().square().sum(1)
 
 
-class ChannelField(ConditionalField):
+class ChannelField(ClosedForm, kind="diffuse"):
     """Leakage, direct wave, images and a diffuse field of a static end and one that moves.
 
     Args:
-        site: kind csi, of a known carrier; one end static, or several stations.
-        values: the terms and their numbers.
-        channel: (A, K) of the targets.
+        settings: terms that are tried.
     """
 
-    kind = "diffuse"
+    name = "waves"
+    both_ends = True
+    site: Site
+    values: Values  # the terms and their numbers
+    channel: tuple[int, int]  # (A, K) of the targets
 
-    def __init__(self, site: Site, values: Values, channel: tuple[int, int]) -> None:
-        self.site, self.values, self.channel = site, values, channel
+    def __init__(self, settings: ChannelSettings | None = None) -> None:
+        self.settings = settings or ChannelSettings()
         self.weights: tuple[Weights, ...] = ()
         self.stations: dict[int, list[Weights]] = {}
         self.common: Common | None = None
         self.rows = np.zeros(0, np.int64)
         self.runs = RunFactors.none()
 
+    @classmethod
+    def of(cls, site: Site, values: Values, channel: tuple[int, int]) -> ChannelField:
+        """One of known terms, to be conditioned; of channels of a known carrier."""
+        result = cls()
+        result.site, result.values, result.channel = site, values, channel
+        return result
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Choose terms and their powers from training and validation rows, and condition on these.
+
+        Raises:
+            ValueError: the data are no channels of a known carrier with one static end.
+        """
+        budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
+        self.site, self.channel = data.site, (int(data.target.shape[1]), int(data.target.shape[2]))
+        self.values, notes = find_terms(data, rows, self.settings, budget)
+        self.condition(data, rows)
+        return FitReport(budget.counted.wall, notes, budget.limited_by)
+
     @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.values.direct or self.count > 0
+        return self.values.direct or self.size() > 0
 
-    @property
-    def count(self) -> int:
+    def size(self) -> int:
         """Images."""
         return self.values.count
 
@@ -127,7 +150,7 @@ class ChannelField(ConditionalField):
         return SiteObjects.of(planes=planes if len(planes) else None)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; factors of runs are estimated by likelihood where there are several.
+        """See `ClosedForm`; factors of runs are estimated by likelihood where there are several.
 
         Raises:
             ValueError: channels of another shape than the field's.
@@ -159,8 +182,8 @@ class ChannelField(ConditionalField):
         heard = [(known.group, known.given.weights, known.scale) for known in weights]
         self.common = Common.of(values, heard) if len(self.stations) > 1 else None
 
-    def __call__(self, query: Query) -> Prediction:
-        """See `ConditionalField`.
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`.
 
         Without stations those at the static places are asked, the first of several at one. Of one that no
         row was learned of, what ends have in common answers (`Common`).
@@ -179,7 +202,7 @@ class ChannelField(ConditionalField):
             mean.to(device),
             after.to(dtype).to(device),
             (after / before.clamp_min(1e-300)).clamp(0, 1).to(dtype).to(device),
-            share.to(device) if self.count else None,
+            share.to(device) if self.size() else None,
         )
         return self.runs.restored(told, query.run)
 
@@ -189,7 +212,7 @@ class ChannelField(ConditionalField):
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
         values, size = self.values, math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
-        share = torch.zeros_like(mean) if self.count else mean
+        share = torch.zeros_like(mean) if self.size() else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
         disturbed = sum(values.of(name).sum() for name in ("noise", "fast", "drift"))
@@ -205,7 +228,7 @@ class ChannelField(ConditionalField):
                 slot = slots[number]
                 cross = fields[min(number, len(fields) - 1)] + specular(values, slot, places, learned)
                 slot.put(mean, here, known.given.mean(cross))
-                if self.count:
+                if self.size():
                     slot.put(share, here, known.given.mean(explained(values, slot, places, learned)))
                 removed = known.given.known(cross) if exact else known.learned(cross)
                 weight = known.scale * known.group.target.shape[1] / size
@@ -258,7 +281,7 @@ class ChannelField(ConditionalField):
             before.index_add_(0, here, prior_variance * outputs / size)
 
     def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`; in the phase and level of each row's own run.
+        """See `ClosedForm`; in the phase and level of each row's own run.
 
         What rows have in common by their order alone is not predicted: no query has it.
         """
@@ -279,13 +302,11 @@ class ChannelField(ConditionalField):
 
     def _conditioned(self) -> tuple[Weights, ...]:
         if not self.weights:
-            raise ValueError(
-                "the field of channels is not conditioned yet; call condition or initialise first"
-            )
+            raise ValueError("waves: not conditioned yet; call fit or condition first")
         return self.weights
 
     def state(self) -> dict[str, Any]:
-        """See `ConditionalField`; factors are computed again by `restored`."""
+        """See `Method.state`; factors are computed again by `restore`."""
         groups = [each.group for each in self._conditioned()]
         return {
             "shape": self.values.state(),
@@ -303,19 +324,15 @@ class ChannelField(ConditionalField):
             ],
         }
 
-
-def restored(site: Site, state: dict[str, Any]) -> ChannelField:
-    """The field whose `state()` this was."""
-    shape, values = dict(state["shape"]), dict(state["values"])
-    shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-    for name in [name for name in values if name.startswith("log_")]:  # of earlier files
-        values[name.removeprefix("log_")] = values.pop(name).exp()
-    antennas, tones = (int(n) for n in state["channel"])
-    field = ChannelField(site, Values(**shape, **values), (antennas, tones))
-    field.rows, runs = state["rows"].numpy(), RunFactors.read(state)
-    groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
-    field._solve(groups, runs.runs, runs.factors)
-    return field
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        shape, antennas_tones = dict(state["shape"]), [int(n) for n in state["channel"]]
+        shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
+        self.site, self.channel = site, (antennas_tones[0], antennas_tones[1])
+        self.values, self.rows = Values(**shape, **state["values"]), state["rows"].numpy()
+        runs = RunFactors.read(state)
+        groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
+        self._solve(groups, runs.runs, runs.factors)
 
 
 def _covariances(groups: tuple[Group, ...], values: Values) -> list[Tensor]:

@@ -32,7 +32,6 @@ from gsparc.models.channels.evidence import (
     normalised,
     without,
 )
-from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.kernels import cells, directions, plain
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.probe import best_offset
@@ -108,13 +107,10 @@ class Candidate:
         return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
 
 
-def initialise(
-    data: Measurements,
-    rows: np.ndarray,
-    settings: ChannelSettings,
-    budget: TimeBudget | None = None,
-) -> tuple[ChannelField, tuple[str, ...]]:
-    """A field conditioned on the rows, and notes about it.
+def find_terms(
+    data: Measurements, rows: np.ndarray, settings: ChannelSettings, budget: TimeBudget
+) -> tuple[Values, tuple[str, ...]]:
+    """Return the terms with their numbers, and notes about them.
 
     Args:
         data: kind csi.
@@ -125,15 +121,11 @@ def initialise(
     Raises:
         ValueError: the data are no channels of a known carrier with one static end.
     """
-    rows, budget = np.asarray(rows), budget or TimeBudget()
     start, factors, notes = _isotropic(data, rows, budget)
     settings = replace(settings, rows=budget.effort.term_rows)
     search = _Search.of(data, rows, settings, start, factors)
     best, more = search.run(budget)
-    channel = (int(data.target.shape[1]), int(data.target.shape[2]))
-    field = ChannelField(data.site, best.values, channel)
-    field.condition(data, rows)
-    return field, (*notes, *more)
+    return best.values, (*notes, *more)
 
 
 def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[Values, Tensor, list[str]]:

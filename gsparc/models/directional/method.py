@@ -23,10 +23,10 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.conditional import LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.models.directional.triangulation import Rays, triangulate
-from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse
+from gsparc.models.image_sources.frame import Frame, refuse
 from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows, gather
 from gsparc.models.image_sources.scene import steering
@@ -96,7 +96,7 @@ KERNELS = tuple(GainKernel(c, length, noise) for c in CONSTANTS for length in LE
 REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # during position refinement
 
 
-class DirectionalGP(FramedMethod):
+class DirectionalGP(ClosedForm, kind="rays"):
     """Gaussian process on channels of a moving receiver with measured directions; queries need none.
 
     Args:
@@ -135,9 +135,9 @@ class DirectionalGP(FramedMethod):
         if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
         sources = sources[seen[:, sources].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
-        self.site, self.antennas = data.site, data.target.shape[1]
+        self.site = data.site
         everything = gather(data, known, self.row_limit, self.seed)
-        self.frame = frame_of(data.site, everything)
+        self.frame = Frame.of(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         self.positions = UncertainPositions(points - self.frame.middle, covariance)
         self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources])
@@ -257,7 +257,7 @@ class DirectionalGP(FramedMethod):
         """See `Method.predict`; the variance includes gains, noise and visibility."""
         answering = self._exact() if query.tx.dtype == torch.float64 else self
         seen = answering._query(query)
-        return self._prediction(answering._sum(seen), *answering._variance(seen))
+        return self.frame.prediction(answering._sum(seen), *answering._variance(seen))
 
     def _exact(self) -> DirectionalGP:
         """The same in float64."""
@@ -267,9 +267,9 @@ class DirectionalGP(FramedMethod):
 
     def _sum(self, query: QueryGeometry) -> Tensor:
         """Predicted mean channels (B, A, K) of a query's receivers."""
-        tones = torch.from_numpy(self._fitted().tones())
+        tones = torch.from_numpy(self._fitted().site.tones())
         gains = query.probability[:, :, None] * self._gains(query)
-        return self._stored(gains.mT @ wave_over_band(query.away, tones, self.power.dtype), tones)
+        return self.frame.stored(gains.mT @ wave_over_band(query.away, tones, self.power.dtype), tones)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
@@ -277,11 +277,11 @@ class DirectionalGP(FramedMethod):
         gain = seen.probability * wave(seen.away, self.frame.carrier_hz)
         gain = self._gains(seen) * gain[:, :, None]
         towards = self.sources - seen.places.view(seen.count, -1, 3).mean(1)[:, None]
-        return self._stored_paths(gain.movedim(1, -1), seen.away, towards)
+        return self.frame.paths(gain.movedim(1, -1), seen.away, towards)
 
     def _query(self, query: Query) -> QueryGeometry:
         """Query geometry of receivers, their antennas in the regression's frame."""
-        flat, count = self._places(query)
+        flat, count = self._fitted().places(query)
         dtype = self.power.dtype
         retained = torch.zeros(0, len(flat), len(self.rows), dtype=dtype)
         if len(self.uncertain):
@@ -334,14 +334,13 @@ class DirectionalGP(FramedMethod):
             group = torch.nonzero(self.observer == one).flatten()
             own, _ = left_out_group(inverse, self.conditioned.weights, group)
             predicted[group] -= cross[group] @ (inverse[:, group] @ own)
-        return self._left_out(self.rows, predicted)
+        return self.frame.left_out(self.rows, predicted)
 
     # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        self._fitted()
         return {
-            **self._frame_state(self.rows),
+            **self._fitted().state(self.rows),
             "observer": self.observer,
             "sources": self.sources,
             "open": self.positions.covariance,
@@ -352,11 +351,21 @@ class DirectionalGP(FramedMethod):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.rows = self._restore_frame(site, state)
+        self.site, (self.frame, self.rows) = site, Frame.read(site, state)
         self.observer, self.power, points = state["observer"], state["power"], state["sources"]
         self.positions = UncertainPositions(points, state["open"])
         self.kernel, self.visibility = GainKernel(*state["law"]), VisibilityGP(*state["sightings"])
         self._prepare()
+
+    def _fitted(self) -> Frame:
+        if self.site is None or not self.size():
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.frame
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Of sources whose receivers are measured, too."""
+        return ("phase", "visibility")
 
     def size(self) -> int:
         """Sources."""

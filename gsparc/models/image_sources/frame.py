@@ -1,4 +1,4 @@
-"""Normalisation of positions and targets for fitting, and back; what methods fitted in a frame share."""
+"""Normalisation of positions and targets for fitting, and back."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.conditional import LeftOutRows
+from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources.rows import Rows, query_elements, static_array
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
@@ -22,110 +22,88 @@ SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are 
 
 @dataclass(frozen=True)
 class Frame:
-    """Offset and scale between local metres and stored units, and those of the fit.
+    """Offset and scale between local metres and stored units, and those of a fit.
 
     Attributes:
+        site: that was measured.
+        antennas: A, outputs of a measurement.
         middle: (3,) float64 [m], local; origin of the fit.
         scale: stored target = scale * normalised target.
         carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first [Hz].
     """
 
+    site: Site
+    antennas: int
     middle: Tensor
     scale: float
     carrier_hz: float
+
+    @staticmethod
+    def of(site: Site, antennas: int, rows: Rows) -> Frame:
+        """Return that in which these rows have zero mean position and unit power.
+
+        Raises:
+            ValueError: every channel is zero.
+        """
+        frequency = site.tones()
+        carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
+        power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
+        if not power > 0:
+            raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
+        return Frame(site, antennas, rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
     def inside(self, rows: Rows) -> Rows:
         """Rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
 
-
-class FramedMethod(Method):
-    """A process on channels that is fitted in a frame.
-
-    Attributes:
-        site: None before `fit` and `restore`.
-        antennas: A, outputs of a measurement.
-        frame: of the fit.
-    """
-
-    site: Site | None = None
-    antennas: int
-    frame: Frame
-
-    def gradient_problem(self) -> str | None:
-        """None; see `Method.gradient_problem`."""
-        return None
-
-    def _fitted(self) -> Site:
-        if self.site is None or not self.size():
-            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
-        return self.site
-
-    def _places(self, query: Query) -> tuple[Tensor, int]:
+    def places(self, query: Query) -> tuple[Tensor, int]:
         """Antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        site = self._fitted()
-        if site.moving_end == "rx":
-            places = query_elements(site, query.rx, len(query), self.antennas)
-            return places.reshape(-1, 3) - self.frame.middle, len(places)
-        places = query.tx.cpu().double() - self.frame.middle
-        array = static_array(site, self.antennas)
+        if self.site.moving_end == "rx":
+            places = query_elements(self.site, query.rx, len(query), self.antennas)
+            return places.reshape(-1, 3) - self.middle, len(places)
+        places = query.tx.cpu().double() - self.middle
+        array = static_array(self.site, self.antennas)
         if array is None:
             return places, len(places)
         each = torch.repeat_interleave(places, len(array), 0)
         return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
 
-    def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
+    def stored(self, mean: Tensor, tones: Tensor) -> Tensor:
         """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
-        tone_scale = (self.frame.carrier_hz / tones).float()
-        return (mean * (tone_scale * self.frame.scale)).reshape(-1, self.antennas, len(tones))
+        tone_scale = (self.carrier_hz / tones).float()
+        return (mean * (tone_scale * self.scale)).reshape(-1, self.antennas, len(tones))
 
-    def _prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
-        """From the mean (B, A, K), and expected squared error and power (B E,), normalised."""
+    def prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
+        """Of the mean (B, A, K), all of it by sources, and squared error and power (B E,), normalised."""
         variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
-        return Prediction(mean, variance * self.frame.scale**2, (variance / prior).clamp(0, 1))
+        return Prediction(mean, variance * self.scale**2, (variance / prior).clamp(0, 1), mean)
 
-    def _stored_paths(
-        self, gain: Tensor, away: Tensor, towards: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, gain: Tensor, away: Tensor, towards: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `ImageSourceGP.paths`; of gains (B E, R, N), ranges (B E, N) [m], offsets (B, N, 3) [m]."""
         count = len(towards)
-        gain = (gain * self.frame.scale).reshape(count, self.antennas, -1)
+        gain = (gain * self.scale).reshape(count, self.antennas, -1)
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-        return gain, delay, unit, self.frame.carrier_hz
+        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), self.carrier_hz
 
-    def _left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
+    def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
-        scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
+        scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
         unknown = torch.full((len(predicted),), float("nan"))
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
-    def _frame_state(self, rows: Rows) -> dict[str, Any]:
-        """Antennas, frame and rows."""
-        frame, columns = ([*vars(each).values()] for each in (self.frame, rows))
-        return {"antennas": self.antennas, "frame": frame, "rows": columns}
+    def state(self, rows: Rows) -> dict[str, Any]:
+        """What `read` reads, with the rows in the frame."""
+        numbers = [self.middle, self.scale, self.carrier_hz]
+        return {"antennas": self.antennas, "frame": numbers, "rows": [*vars(rows).values()]}
 
-    def _restore_frame(self, site: Site, state: dict[str, Any]) -> Rows:
-        self.site, self.antennas, self.frame = site, int(state["antennas"]), Frame(*state["frame"])
-        return Rows(*state["rows"])
-
-
-def frame_of(site: Site, rows: Rows) -> Frame:
-    """Frame in which these rows have zero mean position and unit power.
-
-    Raises:
-        ValueError: every channel is zero.
-    """
-    frequency = site.tones()
-    carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
-    power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
-    if not power > 0:
-        raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
-    return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
+    @staticmethod
+    def read(site: Site, state: dict[str, Any]) -> tuple[Frame, Rows]:
+        """Inverse of `state`."""
+        return Frame(site, int(state["antennas"]), *state["frame"]), Rows(*state["rows"])
 
 
 def refuse(site: Site, name: str) -> None:

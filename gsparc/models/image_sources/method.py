@@ -17,8 +17,9 @@ from torch import Tensor
 from gsparc.data.assemble import identity
 from gsparc.data.query import Query
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.models.conditional import LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
 from gsparc.models.image_sources.ensemble import (
     Look,
@@ -28,7 +29,7 @@ from gsparc.models.image_sources.ensemble import (
     refined,
     search_many,
 )
-from gsparc.models.image_sources.frame import FramedMethod, frame_of, refuse, refuse_turning
+from gsparc.models.image_sources.frame import Frame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
@@ -60,7 +61,7 @@ LOOKED_AT = 200  # rows of the group that a search leaves out, after each round
 ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
 
 
-class ImageSourceGP(FramedMethod):
+class ImageSourceGP(ClosedForm, kind="sources"):
     """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
@@ -80,7 +81,6 @@ class ImageSourceGP(FramedMethod):
     """
 
     name = "image_source_gp"
-    held: LeftOutRows | None = None  # rows of `FitContext.leave_out`, by searches without them
     _groups: tuple[np.ndarray, ...] = ()
     resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
@@ -135,13 +135,13 @@ class ImageSourceGP(FramedMethod):
         if not context.leave_out:
             context = replace(context, effort=ALONE * context.effort)
         budget = context.time_budget(cache.spent)
-        self.site, self.antennas = data.site, data.target.shape[1]
-        self.frame = frame_of(data.site, gather(data, known, self.row_limit, self.seed))
+        self.site, antennas = data.site, data.target.shape[1]
+        self.frame = Frame.of(data.site, antennas, gather(data, known, self.row_limit, self.seed))
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         notes: list[str] = []
-        self.factors = torch.ones(self.antennas, dtype=torch.complex64)
-        calibrated = static_array(data.site, self.antennas) is not None and self.offsets == "none"
+        self.factors = torch.ones(antennas, dtype=torch.complex64)
+        calibrated = static_array(data.site, antennas) is not None and self.offsets == "none"
         if calibrated:
             start = self._row_sets(data, known, 1)[0]
             data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
@@ -198,7 +198,7 @@ class ImageSourceGP(FramedMethod):
         if (self.factors != 1).any():
             turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
             notes.append(
-                f"factors of the {self.antennas} antennas estimated, phases up to {turned:.0f} degrees "
+                f"factors of the {len(self.factors)} antennas estimated, phases up to {turned:.0f} degrees "
                 "from the first's"
             )
         return [f"{self.name}: {note}" for note in notes]
@@ -264,7 +264,7 @@ class ImageSourceGP(FramedMethod):
     def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
         direct = Scene(self._transmitter(), torch.zeros(0, 4).double(), ((),), torch.zeros(1), 0.0)
-        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.antennas))
+        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
             rows = self._row_sets(aligned, known, 1)
@@ -304,14 +304,14 @@ class ImageSourceGP(FramedMethod):
         The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
         the expected power.
         """
-        flat, _ = self._places(query)
-        tones = torch.from_numpy(self._fitted().tones())
+        frame = self._fitted()
+        (flat, _), tones = frame.places(query), torch.from_numpy(frame.site.tones())
         made = self.query.exact if query.tx.dtype == torch.float64 else self.query
         stack, variance, prior = made.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
+        return frame.prediction(frame.stored(mean, tones) / self.factors[:, None], variance, prior)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums: one per source of every search, with the search's weight.
@@ -321,22 +321,22 @@ class ImageSourceGP(FramedMethod):
             vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
             the carrier [Hz].
         """
-        flat, count = self._places(query)
+        flat, count = self._fitted().places(query)
         carrier = self.frame.carrier_hz
         middle = flat[:, :3].reshape(count, -1, 3).mean(1)
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = self.query.pack.ranges(flat)
         gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
         towards = self.query.pack.sources - middle[:, None]
-        gains, delay, unit, carrier = self._stored_paths(gain.movedim(0, -1), away, towards)
+        gains, delay, unit, carrier = self.frame.paths(gain.movedim(0, -1), away, towards)
         return gains / self.factors[:, None], delay, unit, carrier
 
     def left_out(self) -> LeftOutRows:
         """Receivers, each predicted from all others."""
-        self._fitted()
+        frame = self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
-        return self._left_out(self.members[0].rows, predicted)
+        return frame.left_out(self.members[0].rows, predicted)
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
@@ -372,9 +372,8 @@ class ImageSourceGP(FramedMethod):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        self._fitted()
         return {
-            **self._frame_state(self.members[0].rows),
+            **self._fitted().state(self.members[0].rows),
             "weights": self.weights,
             "noise_floor": self.noise_floor,
             "factors": self.factors,
@@ -383,10 +382,36 @@ class ImageSourceGP(FramedMethod):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        rows = self._restore_frame(site, state)
+        self.site, (self.frame, rows) = site, Frame.read(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
         self.factors = state["factors"]
         self._conditioned(rows, [Scene.from_state(stored, self.noise_floor) for stored in state["scenes"]])
+
+    def _fitted(self) -> Frame:
+        if self.site is None or not self.members:
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.frame
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Carrier phase, and visibility where it is modelled."""
+        return ("phase", "visibility") if any(len(one.scene.clutter) for one in self.members) else ("phase",)
+
+    def objects(self) -> SiteObjects:
+        """Planes and boxes of the heaviest search."""
+        scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
+        planes = scene.planes.double()
+        normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
+        boxes = scene.clutter.boxes.double().view(-1, 2, 3) + middle
+        return SiteObjects.of(moved.numpy(), boxes.numpy())
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ClosedForm`; offsets of snapshots were estimated with the gains, which stay."""
+        if self.offsets == "none":
+            data = replace(data, target=data.target * self.factors.numpy()[:, None])
+            inside = self.frame.inside(gather(data, rows, self.row_limit, self.seed))
+            self._conditioned(inside, [member.scene for member in self.members])
 
     def size(self) -> int:
         """Sources of the largest scene."""

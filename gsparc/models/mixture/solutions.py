@@ -1,4 +1,4 @@
-"""Solutions that initialisers of conditional fields find, and their mean by weights from held-out rows."""
+"""Candidates are fitted with groups of rows held out, and weighed by these."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.conditional import ConditionalField, LeftOutRows
-from gsparc.models.fields import INITIALISERS
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
@@ -36,24 +35,24 @@ log = logging.getLogger(__name__)
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
 FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
-OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what effort they are given
-CLUTTERED = ("sources", "scene", "joint_powers")  # initialisers to which `clutter` means something
+OPEN_ENDED = ("sources", "bearings", "scene")  # candidates that take what effort they are given
+CLUTTERED = ("sources", "scene", "joint_powers")  # candidates to which `clutter` means something
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
 def find(
     parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
     context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
-) -> tuple[dict[str, ConditionalField], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
-    """What initialisers find, what each cost, and which settings each read.
+) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
+    """Fit candidates; return them, what each cost, and which settings each read.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution
-    predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
+    predicts every group from the others (`ClosedForm.held`): errors to weigh them by. A search with
     few sources is a solution of its own next to the one that takes all its effort: many sources fit rows near
     others better, few of them what is far.
 
     Args:
-        parts: names of initialisers, which have settings `init`.
+        parts: names in `CANDIDATES`, which have settings `init`.
         fold: validation rows are solved for, too, where nothing is weighed.
         budget: running; what is left of it ends each.
         cut: how training rows are cut; None of one initialiser.
@@ -69,7 +68,7 @@ def find(
         if several and part in SEARCHES:
             plans.append((f"few {part}", replace(init, **FEW)))
         plans.append((part, init))
-    fields: dict[str, ConditionalField] = {}
+    fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
     read: dict[str, set[str]] = {}
     ended: dict[str, str] = {}
@@ -93,9 +92,9 @@ def find(
             within = replace(within, leave_out=leave_out, race=race)
             with heeded.apart() as read[name], late_when(budget.over):
                 clutter = part not in CLUTTERED or effects.visibility is not False
-                field, report = INITIALISERS[part](data, rows, settings, clutter, within)
-                if isinstance(field, Mixture) and effects.residual is False:
-                    field = next(one for _, one in field.parts())
+                kind = "powers" if part == "scene" and data.site.kind == "rssi" else part
+                field = CANDIDATES[kind](settings, clutter, effects.residual is not False, within)
+                report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
             if part not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups)
@@ -131,8 +130,8 @@ def _reached(race: Race | None) -> str | None:
 
 
 def weighed(
-    solutions: dict[str, ConditionalField], data: Measurements, fold: Fold, cut: InnerFolds | None
-) -> dict[str, tuple[ConditionalField, float]]:
+    solutions: dict[str, ClosedForm], data: Measurements, fold: Fold, cut: InnerFolds | None
+) -> dict[str, tuple[ClosedForm, float]]:
     """Solutions with their weights where positive, by rows which they were not conditioned on.
 
     Those are validation rows, and training rows as `cut`; one solution needs neither.
@@ -147,7 +146,7 @@ def weighed(
     batch = data.batch(fold.val)
     predicted = []
     for field in solutions.values():
-        mean = field(batch).mean
+        mean = field.predict(batch).mean
         if len(rows):
             assert field.held is not None
             order = {row: place for place, row in enumerate(field.held.rows.tolist())}
@@ -170,12 +169,6 @@ def weighed(
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 
 
-def joined(members: dict[str, tuple[ConditionalField, float]]) -> ConditionalField:
-    """The weighed mean, or the only one."""
-    fields, weights = zip(*members.values(), strict=True)
-    return fields[0] if len(fields) == 1 else Mixture(fields, weights)
-
-
 def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
     """Training rows (n,) of each group."""
     result = [np.intersect1d(one.test, train) for one in cut.folds]
@@ -183,7 +176,7 @@ def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _held(
-    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
+    field: ClosedForm, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
 ) -> LeftOutRows | None:
     """Rows of every group, predicted from the others with the parameters of all; None without groups."""
     if not groups:
@@ -192,7 +185,7 @@ def _held(
     for group in groups:
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
-        answers.append(field(batch))
+        answers.append(field.predict(batch))
     field.condition(data, rows)
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)

@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
-from gsparc.models.conditional import LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
@@ -70,7 +70,7 @@ class Spectra:
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
-class MovingArrayField(Differentiable):
+class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
     It searches until the leave-one-out error stops falling, the searches are done or the seconds are over.
@@ -107,6 +107,7 @@ class MovingArrayField(Differentiable):
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name = seed, name
         self.trends: list[Trend] = []
+        self.rows = np.zeros(0, np.int64)  # that it was conditioned on; none where it was restored
         self._budget = TimeBudget()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -119,7 +120,14 @@ class MovingArrayField(Differentiable):
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
         self._budget, self._lags = context.time_budget(), None
-        return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
+        report = super().fit(data, fold, context)
+        self.rows = heard(data, np.concatenate([fold.train, fold.val]))
+        return replace(report, limited_by=self._budget.limited_by)
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Sources seen through the array, and a residual where one is fitted."""
+        return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""
@@ -165,17 +173,9 @@ class MovingArrayField(Differentiable):
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
     @torch.no_grad()
-    def condition(self, data: Measurements, rows: np.ndarray) -> np.ndarray:
-        """Powers, trends, residual and errors anew, with the sources and kernels of the fit.
-
-        Args:
-            data: of the site that was fitted.
-            rows: (n,) to learn from.
-
-        Returns:
-            Those of the rows where something was heard.
-        """
-        rows = heard(data, rows)
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """Powers, trends, residual and errors anew, with the sources and kernels of the fit."""
+        self.rows = rows = heard(data, rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
@@ -184,7 +184,6 @@ class MovingArrayField(Differentiable):
         for one in before:
             modelled += self._add(spectra, one.sources, self._powers(spectra, one.sources), one.kernel)
         self._complete(spectra, modelled / len(self.trends), self.residual.kernel, targets)
-        return rows
 
     def _exponent(self, targets: np.ndarray) -> int:
         """Whether pixels are amplitude (2) or power (1).
@@ -271,10 +270,12 @@ class MovingArrayField(Differentiable):
         )  # fmt: skip
         self._left_error = torch.cat(errors)
 
-    def left_out(self, rows: np.ndarray) -> LeftOutRows:
-        """Images of the training rows (n,), each predicted from the others; of a field just conditioned."""
+    def left_out(self) -> LeftOutRows:
+        """See `ClosedForm`; images."""
+        if not len(self.rows):
+            raise ValueError(f"{self.name}: condition it first, a stored one has no rows to leave out")
         mean = torch.cat([self.basis.images(part).clamp_(0, 1) for part in self._left.split(BLOCK)])
-        return LeftOutRows(rows, mean, self._left_error)
+        return LeftOutRows(self.rows, mean, self._left_error)
 
     # -- answering ---------------------------------------------------------------------------------
 

@@ -93,9 +93,9 @@ class PlanarGaussians(GaussianNetwork):
             raise ValueError("Gaussians of directions around a receiver that moves lie nowhere")
         towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
         means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
-        turned = turned_about_normal(self.frames, self.angles[None, :, None] / 2)[0]
+        turned = turned_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
         quats = Rotation.from_matrix(receiver.rotation.numpy()) * Rotation.from_quat(
-            turned.numpy(), scalar_first=True
+            turned, scalar_first=True
         )
         widths = self.log_widths.exp().double().numpy()
         return GaussianCloud(

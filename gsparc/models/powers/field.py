@@ -9,7 +9,6 @@ process.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +19,11 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.data.walls import SceneWalls
 from gsparc.models.baselines.distance_law import law_of
-from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
@@ -29,54 +31,105 @@ from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
-from gsparc.processes.posterior import Exact
+from gsparc.processes.posterior import Exact, approximated
 from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
-from gsparc.processes.trend import Trend, Walls, trend_of
-from gsparc.training.time_budget import Effort, TimeBudget
+from gsparc.processes.trend import Trend, trend_of
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import TimeBudget
 
 QUERIES = 512  # at a time: memory
 
 
-class PowerField(ConditionalField):
-    """See `ConditionalField`; targets are linear powers (1,). Settings have the largest left-out likelihood.
+class PowerField(ClosedForm, kind="powers"):
+    """Powers of one station, (1,) linear, by settings of the largest left-out likelihood.
 
     Args:
-        site: of powers, with at most one end that stands.
-        trend: the mean law.
-        kernel: of the process.
-        seed: of rows drawn where there are too many.
-        fringes: of coherent waves, beside the process.
-        others: further priors with their shares in the mean; the rest is that of trend and kernel.
+        waves: whether coherent ones are sought where neighbours are closer than half a wavelength.
+        seed: of rows and waves that are drawn.
+        walls: that are known, in the coordinates of the measurements; no waves are sought beside them.
     """
 
-    kind = "powers"
+    name = "process of powers"
+    both_ends = uses_censored = True
+    site: Site
+    trend: Trend  # the mean law
+    kernel: Kernel
 
-    def __init__(
-        self,
-        site: Site,
-        trend: Trend,
-        kernel: Kernel,
-        seed: int = 0,
-        fringes: Fringes | None = None,
-        others: Sequence[tuple[float, Prior]] = (),
-    ) -> None:
-        self.fringes, self.others = fringes, tuple(others)
-        self.site, self.trend, self.kernel, self.seed = site, trend, kernel, seed
-        self.process: PowerProcess | None = None
+    def __init__(self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None) -> None:
+        self.waves, self.seed, self.walls = waves, seed, walls
+        self.fringes: Fringes | None = None  # of coherent waves, beside the process
+        self.others: tuple[tuple[float, Prior], ...] = ()  # with shares of the mean, beside trend and kernel
+        self.powers: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
         self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
         self.decibels = np.zeros(0)
 
+    @classmethod
+    def of(cls, site: Site, trend: Trend, kernel: Kernel) -> PowerField:
+        """One of known settings, to be conditioned."""
+        result = cls()
+        result.site, result.trend, result.kernel = site, trend, kernel
+        return result
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Choose settings by training and validation rows, and condition on these.
+
+        Raises:
+            ValueError: no rows.
+        """
+        budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
+        if not len(rows):
+            raise ValueError("a process of powers needs at least one row")
+        self.site, self.fringes, self.others = data.site, None, ()
+        notes = self._choose(data, rows, budget)
+        self.condition(data, rows)
+        return FitReport(budget.counted.wall, notes, budget.limited_by)
+
+    def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
+        """Set the law, the kernel, waves and further priors; what must be said of them."""
+        seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
+        if self.walls is not None:
+            walls = counted(self.walls, site.origin, site.static_position)
+            law, notes = law_of(seen, site)
+            self.trend = replace(trend_of_rows(seen, law), walls=walls)
+            best = chosen_among(seen, [(self.trend, 0.0, ())], self.seed, chosen_on)
+            self.kernel = best.kernel
+            note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
+            return (note, *notes, *best.notes)
+        found, said = candidates(seen, site, self.seed, chosen_on), list[str]()
+        self.trend, self.kernel = plain = found[0].trend, found[0].kernel
+        if self.waves and not seen.silent.any() and sampled(seen.places, site.wavelength):
+            order = np.argsort(rows)
+            assert site.wavelength is not None
+            self.fringes, note = find_fringes(
+                seen.at(order), rows[order], plain, site.wavelength, self.seed, budget
+            )
+            said.append(note)
+            if self.fringes is not None:  # their share was learned beside this process
+                return (found[0].description, *found[0].notes, note)
+        ((_, first), *others), notes = mixture(seen, found, self.seed, chosen_on)
+        assert isinstance(first.kernel, Kernel) and first.trend is not None
+        self.trend, self.kernel, self.others = first.trend, first.kernel, tuple(others)
+        return (*notes, *said)
+
     @property
-    def count(self) -> int:
-        """See `ConditionalField`; coherent waves count as Gaussians of no extent, far away."""
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, None if self.powers is None else self.powers.posterior)
+
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return None if self.powers is None else self.powers.exact()
+
+    def size(self) -> int:
+        """See `ClosedForm.count`; coherent waves count as Gaussians of no extent, far away."""
         return 0 if self.fringes is None else len(self.fringes.weights)
 
     @property
-    def forgets(self) -> bool:
-        """See `ConditionalField`; coherent waves keep what they were fitted to."""
+    def forgets(self) -> bool:  # type: ignore[override]
+        """See `ClosedForm`; coherent waves keep what they were fitted to."""
         return self.fringes is None
 
     @property
@@ -86,22 +139,22 @@ class PowerField(ConditionalField):
         return tuple(name for name, there in named.items() if there)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level."""
+        """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
         seen = rows_of(data, rows)
         first = Prior(self.kernel, self.trend)
         own, *others = (_given(seen, prior, self.seed) for prior in (first, *(one for _, one in self.others)))
         shares = (share for share, _ in self.others)
-        self.process = replace(own, others=tuple(zip(shares, others, strict=True)))
+        self.powers = replace(own, others=tuple(zip(shares, others, strict=True)))
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
-        if isinstance(nearest := self.process.posterior, Nearest):
+        if isinstance(nearest := self.powers.posterior, Nearest):
             # A silent row may lie at the same place; its noise is larger than any mean's.
-            heard = np.flatnonzero(nearest.noise.numpy() <= self.process.kernel.noise)
-            self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
+            heard = np.flatnonzero(nearest.noise.numpy() <= self.powers.kernel.noise)
+            self.at = heard[cKDTree(self.powers.places[heard]).query(loud.places)[1]]
 
-    def __call__(self, query: Query) -> Prediction:
-        """See `ConditionalField`; (B, 1) linear powers.
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; (B, 1) linear powers.
 
         Raises:
             ValueError: before `condition`.
@@ -113,11 +166,11 @@ class PowerField(ConditionalField):
             part.to(query.tx.dtype) for part in (mean, spread, share, explained)
         )
         power = self._power(mean)
-        explained_power = self._power(explained) if self.count else None
+        explained_power = self._power(explained) if self.size() else None
         return Prediction(power, entry_variance(spread, power, "rssi"), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`; of rows where something was heard.
+        """See `ClosedForm`; of rows where something was heard.
 
         Of very many rows each is predicted without all that was measured at its place.
 
@@ -138,7 +191,7 @@ class PowerField(ConditionalField):
         return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
 
     def state(self) -> dict[str, Any]:
-        """See `ConditionalField`."""
+        """See `Method.state`."""
         lengths, shares, kernel = (torch.tensor(part).double() for part in self.kernel.state().values())
         logit = (shares[0] / shares[1]).log() if len(shares) == 2 else torch.zeros(()).double()
         return {
@@ -153,8 +206,19 @@ class PowerField(ConditionalField):
             "decibels": torch.from_numpy(self.decibels),
             "others": [{**prior.state(), "share": share} for share, prior in self.others],
             **({} if self.fringes is None else {"fringes": self.fringes.state()}),
-            **({} if self.process is None else {"process": self.process.state()}),
+            **({} if self.powers is None else {"process": self.powers.state()}),
         }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        logit = [state["share_logit"][None]] if len(state["log_lengths"]) == 2 else []
+        settings = torch.cat([state["log_lengths"], *logit, state["log_noise"][None]]).double()
+        self.kernel = Kernel.of(settings.numpy(), math.exp(state["log_amplitude"]))
+        self.site, self.trend, self.seed = site, trend_of(state), int(state["seed"])
+        self.fringes = fringes_of(state["fringes"]) if "fringes" in state else None
+        self.others = tuple((float(one["share"]), Prior.read(one)) for one in state.get("others", ()))
+        self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
+        self.powers = PowerProcess.read(state["process"]) if "process" in state else None
 
     def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
         """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
@@ -171,76 +235,14 @@ class PowerField(ConditionalField):
         return nearest_distance(self._tree, places)
 
     def _conditioned(self) -> PowerProcess:
-        if self.process is None:
+        if self.powers is None:
             raise ValueError("a field of powers: condition it first")
-        return self.process
+        return self.powers
 
     def _power(self, decibels: Tensor) -> Tensor:
         return from_real(decibels[:, None], "rssi", (1,))
 
 
-def initialise(
-    data: Measurements,
-    rows: np.ndarray,
-    fringes: bool = True,
-    seed: int = 0,
-    budget: TimeBudget | None = None,
-    walls: Walls | None = None,
-) -> tuple[PowerField, tuple[str, ...]]:
-    """A field of powers and what must be said of it; `condition` is to follow.
-
-    Args:
-        data: powers, of one station where there are several.
-        rows: (n,) to learn from, at least one.
-        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
-        seed: of rows and waves that are drawn.
-        budget: no waves are sought beyond it.
-        walls: that are known; no waves are sought beside them.
-
-    Raises:
-        ValueError: no rows.
-    """
-    if not len(rows):
-        raise ValueError("a field of powers needs at least one row")
-    seen = rows_of(data, rows)
-    waves = walls is None and fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength)
-    chosen_on = (Effort() if budget is None else budget.effort).chosen_on
-    if walls is not None:
-        law, notes = law_of(seen, data.site)
-        trend = replace(trend_of_rows(seen, law), walls=walls)
-        best = chosen_among(seen, [(trend, 0.0, ())], seed, chosen_on)
-        note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
-        return PowerField(data.site, trend, best.kernel, seed), (note, *notes, *best.notes)
-    found, said = candidates(seen, data.site, seed, chosen_on), list[str]()
-    if waves:
-        order = np.argsort(rows)
-        plain = found[0].trend, found[0].kernel
-        assert data.site.wavelength is not None
-        waved, note = find_fringes(seen.at(order), rows[order], plain, data.site.wavelength, seed, budget)
-        said.append(note)
-        if waved is not None:  # their share was learned beside this process
-            notes = (found[0].description, *found[0].notes, note)
-            return PowerField(data.site, *plain, seed, waved), notes
-    ((_, first), *others), notes = mixture(seen, found, seed, chosen_on)
-    assert isinstance(first.kernel, Kernel) and first.trend is not None
-    return PowerField(data.site, first.trend, first.kernel, seed, None, others), (*notes, *said)
-
-
 def _given(rows: Rows, prior: Prior, seed: int) -> PowerProcess:
     assert isinstance(prior.kernel, Kernel) and prior.trend is not None
     return conditioned(rows, prior.trend, prior.kernel, seed)[0]
-
-
-def restored(site: Site, state: dict[str, Any]) -> PowerField:
-    """The field whose `state()` this was."""
-    logit = [state["share_logit"][None]] if len(state["log_lengths"]) == 2 else []
-    settings = torch.cat([state["log_lengths"], *logit, state["log_noise"][None]]).double()
-    kernel = Kernel.of(settings.numpy(), math.exp(state["log_amplitude"]))
-    fringes = fringes_of(state["fringes"]) if "fringes" in state else None
-    others = [(float(one["share"]), Prior.read(one)) for one in state.get("others", ())]
-    field = PowerField(site, trend_of(state), kernel, int(state["seed"]), fringes, others)
-    field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
-    field.at = state["at"].numpy()
-    if "process" in state:
-        field.process = PowerProcess.read(state["process"])
-    return field

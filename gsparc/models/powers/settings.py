@@ -19,6 +19,7 @@ from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
+from gsparc.processes.censored import Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart, bounds_of
 from gsparc.processes.left_out import groups_of, left_out
@@ -240,9 +241,11 @@ def _weighed(rows: Rows, one: Candidate) -> Candidate:
     bounds = bounds_of(len(one.kernel.lengths), distance.numpy())
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
+    last: list[Sites] = []
+
     def objective(at: Tensor) -> Tensor:
         gram = at[-1].exp() * gram_of(at[:-1], distance, terms)
-        return Evidence.apply(gram, values[:, 0], side) / len(values)  # type: ignore[no-untyped-call]
+        return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters(), math.log(one.kernel.amplitude))
     best, value = walked(objective, [start], bounds, EVIDENCE_LOOKS, EVIDENCE_SETTLED)

@@ -17,7 +17,7 @@ GSPARC_ALWAYS Type type_of(const double*) { return Type::kDouble; }
 GSPARC_ALWAYS Type type_of(const int32_t*) { return Type::kInt32; }
 GSPARC_ALWAYS Type type_of(const int64_t*) { return Type::kInt64; }
 
-// A copy of a file of `gsparc.prediction.compiled.blob`: header, table of sections, sections on cache lines.
+// A copy of a file of `gsparc.apps.export.compiled.blob`: header, table of sections, sections on cache lines.
 class Blob {
 public:
     Blob(const void* bytes, int64_t size);  // throws Refused

@@ -161,26 +161,6 @@ def test_offsets_beside_a_carrier_were_refused():
         from_arrays(clean | {"frequency_hz": clean["frequency_hz"] / 1e6, "carrier_hz": np.array(2.44e9)})
 
 
-GIVEN = {
-    **{"c04_ok": "", "c04_conj": "conjugate", "c04_fftorder": "fft_order", "c04_normdelay": "delays_removed"},
-    **{"c04_null_dc": "zeros_unmeasured", "c04_baseband_f_carrier": "", "c05_ok": "", "c05_zenith": "zenith"},
-    **{
-        "c05_clockwise": "clockwise",
-        "c05_db_positive": "decibels",
-        "c12_ok": "",
-        "c12_axes": "exchange_axes",
-    },
-    **{"c12_array_mm": "array_mm"},
-}
-
-
-@pytest.mark.skipif(not (DATA / "strangers").is_dir(), reason="no shared/data/strangers")
-@pytest.mark.parametrize("name", GIVEN)
-def test_a_stranger_file_names_its_convention(name):
-    data = read_any(DATA / "strangers" / f"{name}.npz").data
-    assert settings(convention_warnings(data)) == GIVEN[name].split()
-
-
 @pytest.mark.skipif(not (DATA / "real").is_dir(), reason="no shared/data/real")
 def test_real_channels_are_sound_and_conjugated_ones_are_not():
     path = DATA / "real" / "techtile-csi-920mhz.npz"

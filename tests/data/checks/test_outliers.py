@@ -48,18 +48,6 @@ def test_one_row_at_1e8_rescales_nothing(kind, tmp_path, caplog, capsys):
     assert "row 5: measure far more power" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["spectrum", "csi"])
-def test_a_flipped_byte_is_the_same(kind, tmp_path, caplog):
-    """The exponent's highest bit of a single number."""
-    clean, _ = spoilt(kind, tmp_path, 0)
-    arrays = arrays_of(tmp_path / "clean.npz")
-    arrays[kind] = arrays[kind].astype(np.complex64 if kind == "csi" else np.float32)
-    values = arrays[kind].reshape(-1)
-    values.view(np.uint8)[values.real.dtype.itemsize - 1] ^= 0x40
-    wrong = loaded(tmp_path, arrays)
-    assert wrong.site.target_scale == clean.site.target_scale and "row 0: measure far" in caplog.text
-
-
 @KINDS
 def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
     clean, _ = spoilt(kind, tmp_path, 0)

@@ -145,15 +145,6 @@ def test_a_wild_row_is_named():
     assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
 
 
-def test_a_step_is_found_at_its_row():
-    """The place of the step is sharp where the walk is dense; its size is within the shadowing."""
-    place, level, station = walk(3, step=3.0)
-    level[350:] -= 25
-    steps = level_steps(place, level, station)
-    assert len(steps) == 1 and abs(steps[0].first - 350) <= 6 and steps[0].last < steps[0].first
-    assert steps[0].change_db == pytest.approx(-25, abs=5)
-
-
 def test_two_steps_are_found():
     """Walked thrice, another gain the second time."""
     place, level, station = walk(4, 400)
@@ -224,14 +215,6 @@ def test_real_outages_are_not_taken_for_silence(campus):
         "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line for line in found
     )
     assert not any("sensitivity_db" in line for line in found)
-
-
-def test_other_real_campaigns_raise_few(campus):
-    for name in ("ble-hall-1", "ble-hall-2"):
-        found = warnings_of(real_links(name))
-        assert len(found) <= 1, found
-    assert plausibility.level_warnings(campus.level_db) == []
-    assert plausibility.direction_warnings(campus) == []
 
 
 def test_copies_in_a_file_of_links_were_one_row():

@@ -16,7 +16,6 @@ from measured import (
     MAKERS,
     STATIONS,
     TABLE,
-    ble_arrays,
     channels_of,
     powder_arrays,
     release_variables,
@@ -91,17 +90,12 @@ TECHTILE = {
         "csi.nc, csi_imag: expected shape (E, C, H) with E = 2 as in csi_real, C = 8 as in csi_real, "
         "H = 3 as in csi_real, found (3, 8, 2); transposed?",
     ),
-    "few hosts": ({"hostname": (("g",), np.array(["A05", "A06"]))}, "csi.nc, hostname: expected shape (H,)"),
     "another host": (
         {"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
         "techtile_antenna_locations.yml: no antenna of the tiles G99",
     ),
     "no position": (
         {"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
-        "csi.nc: no cycle has both a position and a channel",
-    ),
-    "NaN positions": (
-        {"rover_y": (("experiment_id", "cycle_id"), np.full((2, CYCLES), np.nan))},
         "csi.nc: no cycle has both a position and a channel",
     ),
 }
@@ -158,16 +152,6 @@ def test_values_that_were_never_written_are_none(tmp_path):
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
-def test_powder_npz_is_geographic(tmp_path):
-    held, arrays = raw_of_powder(write_npz(tmp_path, "powder")).arrays, powder_arrays()
-    assert np.array_equal(held["latitude"], arrays["latitude"]) and "tx_position" not in held
-    where = np.stack([held["station_latitude"], held["station_longitude"]], axis=1)
-    assert np.abs(where - DEGREES).max() < 1e-9  # a tenth of a millimetre
-    assert held["station_name"].tolist() == STATIONS.tolist() and held["carrier_hz"] == 462.7e6
-    assert held["tx_height"] == 1.5 and held["station_height"] == 10
-    assert np.array_equal(held["rssi_db"], arrays["rssi_db"], equal_nan=True)
-
-
 def equal(one: np.ndarray, other: np.ndarray) -> bool:
     if one.dtype.kind == "f":
         return np.allclose(one, other, rtol=0, atol=1e-9, equal_nan=True)
@@ -182,21 +166,6 @@ def test_powder_csv_holds_the_same(tmp_path):
     assert "3 columns left out, no fixed place: bus-6186_rss" in table.attributes["left_out"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("-101", ""),
-        ("-101", "NaN"),
-        ("\n", "\r\n"),
-        ("\n2022-11-23 13:24:05", "\n\n2022-11-23 13:24:05"),
-    ],
-)
-def test_powder_csv_in_other_spellings(tmp_path, old, new):
-    plain = raw_of_powder(write_walk(tmp_path)).arrays
-    other = raw_of_powder(write_walk(tmp_path, lambda text: text.replace(old, new))).arrays
-    assert all(equal(plain[name], other[name]) for name in set(plain) - {"row_name"})
-
-
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
     raw = raw_of_powder(
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
@@ -205,17 +174,12 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
     assert "madsen-nuc2-b210" in raw.attributes["left_out"]
 
 
-HEADER = f"timestamp,bus-6186_rss,bus-6186_x,bus-6186_y,{','.join(STATIONS)},tx_x_coord,tx_y_coord\n"
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
 WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
-    "no header": ((HEADER, ""), TABLE, "are both named '-1'; is there no line of heads?"),
     "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),
-    "binary": (("", ""), "\x00\x01", "location_coordinates.json: not readable"),
     "no latitude": (("tx_x_coord", "east"), TABLE, "line 1: no column tx_x_coord; "),
-    "no longitude": (("tx_y_coord", "east"), TABLE, "line 1: no column tx_y_coord"),
     "swapped degrees": (SWAPPED, TABLE, "latitude is outside -90 to 90 degrees; are latitude and longitude swapped?"),
     "a word": ((":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"), TABLE, "column 'ebc-nuc1-b210', line 3: 'loud-"),
-    "cells missing": ((":00,-101,-1,-1", ":00"), TABLE, "line 2 (6 cells): expected 9 cells"),
     "no degrees": ((f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"), TABLE, "column 'tx_y_coord', line 21: no value"),
     "two transmitters": (("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"), TABLE, "line 1: no column tx_x_coord and tx_y_coord"),
     "column twice": ((STATIONS[1], STATIONS[0]), TABLE, "are both named 'ebc-nuc1-b210'"),
@@ -224,7 +188,6 @@ WALKS = {  # what is replaced in the walk (None: all of it), the table of statio
     "station in words": (("", ""), '{"ebc-nuc1-b210": ["north", 1]}', "ebc-nuc1-b210: expected latitude and"),
     "station beyond the pole": (("", ""), '{"ebc-nuc1-b210": [-111.8, 40.7]}', "ebc-nuc1-b210: latitude -111.8 is outside"),
     "table is code": (("", ""), "__import__('os').getcwd()", "location_coordinates.json: not readable"),
-    "table is a list": (("", ""), "[1, 2]", "expected a table from names"),
 }  # fmt: skip
 
 
@@ -248,25 +211,6 @@ def test_heights_are_metres(tmp_path, refused, height):
     refused("dataset.station_height=", raw_of_powder, path, None, 1.5, height)
 
 
-FAULTS = {  # of an array in the npz: what is done with it, and what is said, by the schema's name
-    "missing": ("ble", "mobile_position", None, "mobile_position: missing"),
-    "transposed": ("ble", "rssi_db", np.transpose, r"rssi_db: expected .*found \(4, 15\)"),
-    "NaN place": ("techtile", "tx_position", lambda a: a * np.nan, "tx_position, row 0, station 0 = "),
-    "beyond the pole": ("powder", "latitude", lambda a: a + 60, "latitude .* is outside -90 to 90"),
-}
-
-
-@pytest.mark.parametrize("case", FAULTS)
-def test_spoilt_files(tmp_path, refused, case):
-    name, array, change, says = FAULTS[case]
-
-    def spoilt(arrays):
-        rest = {key: value for key, value in arrays.items() if key != array}
-        return rest if change is None else {**rest, array: change(arrays[array])}
-
-    refused(says, lambda path: load({"name": name, "file": str(path)}), write_npz(tmp_path, name, spoilt))
-
-
 EVERY = pytest.mark.parametrize("name", MAKERS)
 
 
@@ -278,14 +222,6 @@ def test_absent_damaged_and_foreign_files(tmp_path, refused, name):
     refused("damaged or not an npz", LOADERS[name], path)
     foreign = write_npz(tmp_path, "ble" if name == "techtile" else "techtile")
     refused("position: missing", LOADERS[name], foreign)
-
-
-@EVERY
-def test_settings_of_the_configuration(tmp_path, name):
-    path = write_npz(tmp_path, name)
-    module = datamodule({"name": name, "file": str(path), "stations": [0, 2], "max_rows": 9})
-    assert module.selection.stations == (0, 2) and module.selection.max_rows == 9
-    assert module.name == name and module.selection.runs is None
 
 
 @pytest.mark.parametrize(
@@ -332,13 +268,6 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
         assert np.abs(found - degrees).max() < 1e-7 and np.allclose(world[:, 2], height)
 
 
-def test_ble_is_links_to_sensors(tmp_path):
-    data, arrays = load({"name": "ble", "file": str(write_npz(tmp_path, "ble"))}), ble_arrays()
-    assert data.site.static_end == "rx" and len(data) == 60 and data.site.carrier_hz == 2.44e9
-    assert data.site.stations.name == tuple(arrays["station"])
-    assert np.allclose(data.site.stations.position + data.site.origin, arrays["station_position"])
-
-
 MEASURED = [
     ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4),
     ("powder-rss-462mhz.npz", "powder", None),
@@ -362,19 +291,6 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
     with pytest.raises(DataError, match="this is a file of dataset=ble; say dataset=ble"):
         load({"name": "own", "file": str(file)})
-
-
-def test_measured_phases_fall_with_distance():
-    """One unknown phase per antenna and run: along the line of sight phases fall with distance."""
-    held = raw_of_techtile(real("real/techtile-csi-920mhz.npz")).arrays
-    distance = np.linalg.norm(held["tx_position"][:, None] - held["station_position"], axis=-1)
-    turn = 2 * np.pi * held["frequency_hz"] / 299_792_458 * distance
-    phase = np.where(held["mask"], np.exp(1j * np.angle(held["csi"])), 0)[held["run"] == "EXP005"]
-    falling, rising = (
-        np.abs((phase * np.exp(sign * 1j * turn[held["run"] == "EXP005"])).mean(axis=0)).mean()
-        for sign in (1, -1)
-    )
-    assert falling > 0.3 > 0.1 > rising
 
 
 def test_measured_stations_lie_where_the_release_says():

@@ -75,10 +75,6 @@ class Asks:
         return eval, (self.name,)
 
 
-def alter(path, change):
-    path.write_bytes(change(path.read_bytes()))
-
-
 ALTERS_FUNCTIONS = (
     b"cnumpy.core.numeric\n_frombuffer\n(NS'__name__'\nS'mine'\nsdtb."  # BUILD on what is looked up
 )
@@ -87,11 +83,8 @@ SPOILT = {
     "code in a column": (pickle.dumps([np.ones(3), Asks("open('ran', 'w')")]), r"asks for builtins\.eval"),
     "system": (b"cos\nsystem\n(S'touch ran'\ntR.", r"asks for posix\.system|asks for os\.system"),
     "a dotted name": (b"\x80\x04\x8c\x05numpy\x8c\x0cndarray.data\x93.", r"asks for numpy\.ndarray\.data"),
-    "a reader of numpy": (b"cnumpy\nload\n(S'x'\ntR.", r"asks for numpy\.load"),
     "a function's name": (ALTERS_FUNCTIONS, "damaged, or no pickle of arrays"),
     "cut short": (pickle.dumps(np.arange(9.0))[:-20], "damaged, or no pickle of arrays"),
-    "no pickle": (b"RxPos,CSI\n", "damaged, or no pickle of arrays"),
-    "empty": (b"", "damaged, or no pickle of arrays"),
     "an array": (pickle.dumps(np.ones(3)), "no pickled pandas table"),
     "a recursion": (b"(" * 100_000 + b"." , "damaged|no pickle"),
 }  # fmt: skip
@@ -174,7 +167,6 @@ BLE = {
     "other devices": ("cnf/tetam.dev", "Dongles:{'a': 1}", "tetam.dev, line 1: expected a first line"),
     "place of two": ("cnf/tetam.dev", DEVICES.replace("7.09, 1.22", "7.09"), "line 1: expected a first line"),
     "a word": ("hst/set_1/sensor10_10.5_2.0_1.85.mbd", "1,aa,e7,loud\n", "expected lines of time, sensor, beacon and dBm"),
-    "no packet": ("hst/set_1/sensor10_10.5_2.0_1.85.mbd", "", "expected lines of time"),
     "three cells": ("hst/set_1/sensor10_10.5_2.0_1.85.mbd", "1,aa,-5\n", "expected lines of time"),
     "other sensor": ("hst/set_1/sensor99_1_2_3.mbd", "1,aa,e7,-5\n", "no sensor of cnf/tetam.dev is called 'sensor99'"),
     "place in the name": ("hst/set_1/sensor10_1_2.mbd", "1,aa,e7,-5\n", "expected a name like sensor10_X_Y_Z.mbd"),
@@ -248,13 +240,6 @@ def test_techtile_power_of_other_objects(tmp_path, refused):
     (longer / "17_values.npy").unlink()
     refused("17_values.npy: no such file", raw_of_techtile_power, longer)
     refused("expected one \\*_positions.npy", raw_of_techtile_power, tmp_path)
-
-
-def test_techtile_power_npz_reads_as_it_did():
-    held = raw_of_techtile_power(real("real/techtile-power-reci-rf-1.npz")).arrays
-    assert held["rx_position"].shape == (20382, 3) and held["rssi_db"].dtype == np.float32
-    file = str(real("real/techtile-power-reci-rf-1.npz"))
-    assert len(load({"name": "techtile_power", "file": file, "min_rssi_db": -75})) == 20309
 
 
 def test_rfid_list_of_our_tables_is_out_of_the_200(real_rfid, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.checks.describe import describe, suspicious_values
-from gsparc.data.own import interpret, load_own
+from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.selection import Selection, select
 
@@ -69,11 +69,6 @@ def test_three_access_points_by_their_positions_alone():
     assert any("taken as 3 stations" in note for note in found.notes)
 
 
-def test_both_ends_may_move():
-    data = read({"rx_position": WALK, "tx_position": WALK + 1, "rssi_db": LEVELS[:, 0]}).data
-    assert data.site.static_end is None and data.moving.shape == (PLACES, 6)
-
-
 def test_powers_may_have_an_unknown_transmitter():
     found = read({"rx_position": WALK, "rssi_db": LEVELS[:, 0]})
     assert found.data.site.static_position is None and np.isnan(found.data.tx).all()
@@ -119,25 +114,12 @@ def test_the_mask_wins_over_the_sensitivity():
     assert read(town(rssi_db=holes, mask=mask, sensitivity_db=-80.0)).data.censored is None
 
 
-def test_two_coordinates_and_a_height():
-    data = read(town(tx_position=WALK[:, :2], tx_height=1.5)).data
-    np.testing.assert_allclose(data.tx[:, 2] + data.site.origin[2], 1.5)
-
-
 def test_a_station_at_two_carriers_is_two():
     carriers = np.repeat([4.6e8, 3.5e9], PLACES // 2)
     data = read(town(carrier_hz=carriers)).data
     assert len(data.site.stations) == 2 * STATIONS
     assert data.site.stations.name[:2] == ("north at 460 MHz", "north at 3500 MHz")
     assert data.site.stations.carrier_hz[data.station[-1]] == 3.5e9
-
-
-def test_channels_of_a_run_share_a_factor():
-    csi = RNG.normal(size=(PLACES, STATIONS, 2)) @ [1, 1j]
-    runs = np.array(["a", "b"])[np.arange(PLACES) % 2]
-    data = read(town(rssi_db=None, csi=csi, frequency_hz=9.2e8, run=runs)).data
-    assert data.target.shape == (PLACES * STATIONS, 1, 1)
-    np.testing.assert_array_equal(data.run, np.repeat(np.arange(PLACES) % 2, STATIONS))
 
 
 def test_the_files_own_split_names_rows_of_the_file():
@@ -158,14 +140,12 @@ SPOILT = {
     "names": (town(station_name=np.array(["a", "a", "b"])), "'a' twice"),
     "fewer names": (town(station_name=np.array(["a", "b"])), r"station_name: expected shape \(T,\)"),
     "nan station": (town(station_position=POSTS * [1, np.nan, 1]), "station_position, row 0"),
-    "transposed": (town(station_position=np.ones((3, 5))), "transposed"),
     "no height": (town(tx_position=WALK[:, :2]), "two coordinates; expected .* as tx_height"),
     "height of 3-D": (town(tx_height=1.5), "tx_height: given, but tx_position has three"),
     "both ends and stations": (town(rx_position=WALK), "found rx_position and tx_position"),
     "no end": (town(tx_position=None), "of the end that moves; found neither"),
     "no table": (town(station_position=None, station=np.zeros(PLACES, int)), "without station_position"),
     "all missing": (town(rssi_db=LEVELS * np.nan), "nothing was measured"),
-    "an infinite power": (town(rssi_db=np.where(LEVELS.max() == LEVELS, np.inf, LEVELS)), "not finite"),
     "below the level": (town(sensitivity_db=-50.0), r"row \d+, station \w+: rssi_db is .* below -50"),
     "level of channels": (town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0), "goes with rssi_db"),
     "level of 1e9": (town(sensitivity_db=1e9), "expected dB between -400 and 400"),
@@ -173,7 +153,6 @@ SPOILT = {
         town(tx_position=None, rx_position=WALK, station_orientation=np.eye(4)[:3]), "are not turned",
     ),
     "orientation": (town(station_orientation=np.ones((3, 4))), "row 0: expected a quaternion"),
-    "runs of floats": (town(run=np.zeros(PLACES)), "run: expected text or whole numbers"),
     "mask of another shape": (town(mask=np.ones(PLACES, bool)), "mask: expected shape"),
     "NaN under a mask": (town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)), "not finite"),
     "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
@@ -190,11 +169,6 @@ SPOILT = {
 def test_what_is_wrong_is_one_line(refused, case):
     arrays, says = SPOILT[case]
     refused(says, read, arrays)
-
-
-def test_hdf5_and_npz_alike(tmp_path):
-    np.savez(tmp_path / "town.npz", **town())
-    assert load_own(tmp_path / "town.npz").site.stations.name == ("north", "east", "roof")
 
 
 def test_degrees_become_metres_and_back():

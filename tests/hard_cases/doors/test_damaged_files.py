@@ -12,10 +12,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from doors import assert_found_bad, knock
 from ledger import LEDGER
 
-from gsparc.commands.check import main as check
 from gsparc.data import raw as raw_files
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
@@ -36,22 +34,6 @@ def users_file(path: Path) -> Path:
 def test_variable_length_text_is_read(tmp_path):
     data = load_own(users_file(tmp_path / "mine.h5"))
     assert data.site.name == "garage" and data.row_names[3] == "Raum 3"
-
-
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
-@pytest.mark.parametrize("suffix", ["h5", "npz"])
-def test_cut_short(tmp_path, share, suffix):
-    path = users_file(tmp_path / "whole.h5")
-    if suffix == "npz":
-        with h5py.File(path) as file:
-            np.savez(
-                tmp_path / "whole.npz", **{k: file[k][()] for k in ("rx_position", "csi", "frequency_hz")}
-            )
-        path = tmp_path / "whole.npz"
-    content = path.read_bytes()
-    cut = tmp_path / f"cut.{suffix}"
-    cut.write_bytes(content[: int(share * len(content))])
-    assert_found_bad(knock(lambda: check([str(cut)]), "check", []), rf"cut\.{suffix}.*damaged")
 
 
 @pytest.mark.parametrize(

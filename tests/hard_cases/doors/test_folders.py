@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from doors import assert_found_bad, assert_refused, knock
 from PIL import Image
-from releases import GREY, SPOILT, write_release
+from releases import SPOILT, write_release
 
 from gsparc.commands.check import main as check
 from gsparc.commands.train import main as train
@@ -41,28 +41,13 @@ def rename(old: str, new: str):
 
 
 MORE = {
-    "palette": (lambda r: Image.fromarray(GREY).convert("P").save(r / "spectrum/00003.png"), "found mode P"),
-    "one bit": (lambda r: Image.fromarray(GREY).convert("1").save(r / "spectrum/00003.png"), "found mode 1"),
-    "with alpha": (lambda r: Image.fromarray(GREY).convert("LA").save(r / "spectrum/00003.png"), "mode LA"),
-    "a row less": (picture(GREY[:-1]), "found 360 x 89"),
-    "a column more": (picture(np.zeros((90, 361), np.uint8)), "found 361 x 90"),
     "a single pixel": (picture(np.zeros((1, 1), np.uint8)), "found 1 x 1"),
-    "named in capitals": (rename("spectrum/00003.png", "spectrum/00003.PNG"), "00003.png: missing"),
     "named in Unicode": (rename("spectrum/00003.png", "spectrum/٠٠٠٠٣.png"), "00003.png: missing"),
-    "named without zeros": (rename("spectrum/00003.png", "spectrum/3.png"), "00003.png: missing"),
     "spectrum is a folder": (lambda r: [(r / "spectrum/00003.png").unlink(), (r / "spectrum/00003.png").mkdir()],
                              "00003.png"),
     "csv is a folder": (lambda r: [(r / "tx_pos.csv").unlink(), (r / "tx_pos.csv").mkdir()], "tx_pos.csv"),
     "csv with semicolons": (lambda r: (r / "tx_pos.csv").write_text("x;y;z\n0;0;1\n"), "expected the header"),
     "csv with a quote left open": (rewrite("tx_pos.csv", "0.3000", '"0.3000'), "line"),
-    "csv with a NUL": (rewrite("tx_pos.csv", "0.3000", "0.3\0"), "line"),
-    "csv with Arabic digits": (rewrite("tx_pos.csv", "0.3000,0.2000,1.0000", "x٣,0,1"), "line 5"),
-    "csv hexadecimal": (rewrite("tx_pos.csv", "0.3000", "0x3"), "line 5"),
-    "csv 1e400": (rewrite("tx_pos.csv", "0.3000", "1e400"), "line 5"),
-    "csv with a fourth column": (rewrite("tx_pos.csv", "0.3000,0.2000,1.0000", "0.3,0.2,1,7"), "line 5"),
-    "index negative": (rewrite("train_index.txt", "00001", "-1"), "line 1"),
-    "index fraction": (rewrite("train_index.txt", "00001", "1.5"), "line 1"),
-    "index enormous": (rewrite("train_index.txt", "00001", "9" * 400), "line 1"),
     "index is a folder": (lambda r: [(r / "test_index.txt").unlink(), (r / "test_index.txt").mkdir()],
                           "test_index.txt"),
     "yaml runs code": (lambda r: (r / "gateway_info.yml").write_text("!!python/object/apply:os.system ['true']"),

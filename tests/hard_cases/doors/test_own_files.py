@@ -9,11 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from doors import assert_found_bad, assert_refused, knock
-from ledger import LEDGER
+from doors import assert_found_bad, knock
 
 from gsparc.commands.check import main as check
-from gsparc.commands.train import main as train
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 
@@ -148,50 +146,9 @@ def test_what_is_not_refused_is_finite(tmp_path, name, way):
     )
 
 
-@pytest.mark.parametrize("way", ["nan", "empty", "text", "complex", "transposed", "a record"])
-@pytest.mark.parametrize("name", ["rx_position", "csi", "frequency_hz"])
-def test_hdf5_too(tmp_path, name, way):
-    arrays = channels()
-    arrays[name] = WAYS[way](arrays[name])
-    if (name, way) in HARMLESS:
-        pytest.skip("complex channels are what is wanted")
-    path = store(tmp_path / "spoilt.h5", arrays)
-    assert_found_bad(knock(lambda: check([str(path)]), "check", []), rf"spoilt\.h5(, {name}|: )")
-
-
-@pytest.mark.parametrize("way", ["nan", "text"])
-def test_train_says_it_in_one_line_and_writes_nothing(tmp_path, way):
-    arrays = channels()
-    arrays["rx_position"] = WAYS[way](arrays["rx_position"])
-    path = store(tmp_path / "spoilt.npz", arrays)
-    given = ["dataset=own", f"dataset.file={path}", f"hydra.run.dir={tmp_path / 'run'}", "logger=none"]
-    assert_refused(knock(train, "train.py", given), "rx_position", tmp_path / "run")
-
-
 @pytest.mark.parametrize("unit", ["mm", "cm", "km", "feet"])
 def test_units_that_say_another_length(tmp_path, unit):
     path = store(tmp_path / "units.h5", channels())
     with h5py.File(path, "a") as file:
         file["rx_position"].attrs["units"] = unit
     assert_found_bad(knock(lambda: check([str(path)]), "check", []), f"units are '{unit}'; expected 'm'")
-
-
-@pytest.mark.parametrize("factor,hint", [(1e3, "millimetres"), (1e2, "centimetres"), (1e-3, "kilometres")])
-def test_lengths_in_another_unit_are_hinted_at(tmp_path, factor, hint):
-    """A room of 3 m is not 3 km wide: said as a note, because a valley may be."""
-    arrays = channels()
-    for name in ("rx_position", "tx_position"):
-        arrays[name] = arrays[name] * factor
-    path = store(tmp_path / "far.npz", arrays)
-    answer = knock(lambda: check([str(path)]), "check", [])
-    assert answer.status == 0 and any(hint in line for line in answer.out), answer.out
-
-
-def test_positions_up_to_a_thousand_kilometres_lose_nothing(tmp_path):
-    """Centred in float64: what was 1e6 m away is the same to a tenth of a nanometre."""
-    near, far = channels(), channels()
-    for name in ("rx_position", "tx_position"):
-        far[name] = far[name] + np.array([1e6, -1e6, 1e4])
-    one, two = (load_own(store(tmp_path / f"{n}.npz", a)) for n, a in (("near", near), ("far", far)))
-    assert np.abs(one.rx_position - two.rx_position).max() < 1e-9 and np.array_equal(one.target, two.target)
-    LEDGER.compared("data door", "float64", "forward", float(np.abs(one.tx - two.tx).max()), 1e-9)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
@@ -13,8 +14,8 @@ from gsparc.data.query import Query
 from gsparc.models.channels.columns import gather
 from gsparc.models.channels.covariance import Shape, Values, disturbance, mirrored, signals
 from gsparc.models.channels.evidence import compressed, normalised
-from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import ChannelSettings, initialise
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.probe import Probe
 from gsparc.ops import Pose
@@ -93,7 +94,9 @@ def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
 
 def test_no_wall_is_kept_where_there_is_none():
     data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
-    field, _ = initialise(data, np.arange(len(data)), ChannelSettings(mirrors=2, directions=False))
+    field, _ = fitted_to(
+        ChannelField(ChannelSettings(mirrors=2, directions=False)), data, np.arange(len(data))
+    )
     assert field.values.sequences == () and not len(field.objects().planes)
 
 
@@ -108,11 +111,11 @@ def test_planes_outlive_storing():
     _, values = _bare(data)
     wall = torch.from_numpy(WALL - np.r_[0, 0, 0, WALL[:3] @ data.site.origin])[None]
     power = torch.tensor([0.1, 0.5, 0.02, 0.3, 0.01, 0.01], dtype=torch.float64)
-    field = ChannelField(data.site, replace(values, sequences=((0,),), power=power, planes=wall), (1, 1))
+    field = ChannelField.of(data.site, replace(values, sequences=((0,),), power=power, planes=wall), (1, 1))
     field.condition(data, np.arange(len(data)))
     batch = data.batch(np.arange(9))
-    again = restored(data.site, field.state())
-    torch.testing.assert_close(again(batch).mean, field(batch).mean)
+    again = read_back(field)
+    torch.testing.assert_close(again.predict(batch).mean, field.predict(batch).mean)
     np.testing.assert_allclose(again.objects().planes, wall.numpy())
     assert "mirrors" in again.terms
 
@@ -132,7 +135,7 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
     rows = np.concatenate([fold.train, fold.val])
     errors, unheard = [], []
     for mirrors in (0, 8):
-        field, _ = initialise(data, rows, ChannelSettings(mirrors=mirrors))
+        field, _ = fitted_to(ChannelField(ChannelSettings(mirrors=mirrors)), data, rows)
         errors.append(answer_error(field, data, fold.test))
         with torch.no_grad():
             own = []
@@ -140,7 +143,7 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
                 where = torch.from_numpy(end[number] - data.site.origin).expand(len(place), 3)
                 turned = torch.eye(3).expand(len(place), 3, 3)
                 moving = torch.from_numpy(place - data.site.origin)
-                told_of = field(Query(moving, Pose(where, turned))).mean.reshape(-1).numpy()
+                told_of = field.predict(Query(moving, Pose(where, turned))).mean.reshape(-1).numpy()
                 true = channel[:, number]
                 scale = np.vdot(told_of, true) / np.vdot(told_of, told_of).real
                 own.append(nmse(scale * told_of, true))

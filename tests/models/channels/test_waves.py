@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 from releases import REAL
 from rooms import WAVELENGTH, nmse, shoebox
 from scenes import answer_error, fold_of
@@ -16,8 +17,8 @@ from gsparc.models.channels import evidence
 from gsparc.models.channels.columns import bands, gather
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.covariance import Shape, Values, diffuse_of, disturbance, prior, specular
-from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import ChannelSettings, initialise
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import cells, directed, directions, sphere
 from gsparc.ops import Pose
 from gsparc.processes.left_out import groups_of
@@ -60,7 +61,7 @@ def _whole(data, *, correlated=False, mirrors=1, angles=4):
     middle = torch.from_numpy(data.moving).mean(0)
     shape = Shape(sphere(angles), 5.0, True, True, correlated, middle, 20.0, ((0,),)[:mirrors])
     planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]  # beneath everything
-    field = ChannelField(data.site, _values(shape, planes), tuple(data.target.shape[1:]))
+    field = ChannelField.of(data.site, _values(shape, planes), tuple(data.target.shape[1:]))
     field.condition(data, np.arange(40))
     return field
 
@@ -69,13 +70,13 @@ def test_isotropic_term_alone_is_the_plain_process():
     _, data, fold = shoebox(200, size=(0.7, 0.6, 0.6), max_order=1)
     plain = ComplexGP()
     plain.fit(data, fold, FitContext())
-    field, notes = initialise(data, np.concatenate([fold.train, fold.val]), PLAIN)
+    field, notes = fitted_to(ChannelField(PLAIN), data, np.concatenate([fold.train, fold.val]))
     assert field.terms == ("residual",) and field.count == 0
     if "kept" in notes[1]:  # powers beside the grid's
         field.values = replace(field.values, power=torch.tensor([1.0, plain.kernel.noise]).double())
         field.condition(data, np.concatenate([fold.train, fold.val]))
     batch = data.batch(fold.test)
-    before, after = plain.predict(batch), field(batch)
+    before, after = plain.predict(batch), field.predict(batch)
     torch.testing.assert_close(after.mean, before.mean, rtol=1e-4, atol=1e-4)
     # Its power is the targets' mean square, the field's is that of largest likelihood.
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
@@ -160,7 +161,7 @@ def test_left_out_is_what_refitting_gives(correlated):
         again.condition(data, rest)
         batch = data.batch(np.array([row]))
         with torch.no_grad():
-            found = again(batch)
+            found = again.predict(batch)
         torch.testing.assert_close(found.mean[0], left.mean[row], rtol=1e-3, atol=1e-4)
         scale = field.weights[0].scale / again.weights[0].scale
         # A row's drift is also that of rows before and after it, which no query's is.
@@ -172,7 +173,7 @@ def test_far_away_nothing_is_known():
     data = _sent(60)
     field = _whole(data, mirrors=0)
     far = Pose(torch.tensor([3e4, 0.0, 0.0]), torch.eye(3))
-    found = field(Query(torch.from_numpy(data.tx[:1]).float(), far))
+    found = field.predict(Query(torch.from_numpy(data.tx[:1]).float(), far))
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
     values, known = field.values, field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
@@ -188,7 +189,7 @@ def test_variances_have_the_digits_they_need(noise, plain):
     if plain:
         middle = field.values.middle
         shape = Shape(torch.zeros(0, 3).double(), 5.0, True, False, False, middle, 20.0)
-        field = ChannelField(data.site, _values(shape), tuple(data.target.shape[1:]))
+        field = ChannelField.of(data.site, _values(shape), tuple(data.target.shape[1:]))
     field.values.of("noise")[:] = noise
     field.condition(data, np.arange(40))
     (known,) = field.weights
@@ -216,7 +217,7 @@ def test_slopes_over_places():
     tx = torch.from_numpy(data.tx[:1]).float()
 
     def level(x):
-        found = field(Query(tx, Pose(x, torch.eye(3))))
+        found = field.predict(Query(tx, Pose(x, torch.eye(3))))
         return found.mean.real.sum() + found.variance.sum()
 
     known = place.clone().requires_grad_()
@@ -228,10 +229,10 @@ def test_slopes_over_places():
 
 
 def test_leakage_and_direct_wave_are_found_where_they_are():
-    without, _ = initialise(_sent(90, direct=0.0, leakage=0.0, diffuse=1.0), np.arange(90), ChannelSettings())
+    without, _ = fitted_to(ChannelField(), _sent(90, direct=0.0, leakage=0.0, diffuse=1.0), np.arange(90))
     assert "direct" not in without.terms
     data = _sent(120, diffuse=0.3)
-    field, notes = initialise(data, np.arange(60), ChannelSettings(directions=False))
+    field, notes = fitted_to(ChannelField(ChannelSettings(directions=False)), data, np.arange(60))
     assert {"leakage", "direct"} <= set(field.terms)
     assert any(note.startswith("waves: leakage and direct wave kept") for note in notes)
     plain, none, test = ComplexGP(), np.zeros(0, np.int64), np.arange(60, 120)
@@ -242,7 +243,9 @@ def test_leakage_and_direct_wave_are_found_where_they_are():
 def test_a_static_end_that_stands_elsewhere_is_found():
     moved = END + np.array([0.05, -0.03, 0.0])
     data = _sent(150, leakage=0.0, diffuse=0.2, end=moved, side=1.2)
-    field, _ = initialise(data, np.arange(150), ChannelSettings(directions=False, correlated=False))
+    field, _ = fitted_to(
+        ChannelField(ChannelSettings(directions=False, correlated=False)), data, np.arange(150)
+    )
     assert "direct" in field.terms
     np.testing.assert_allclose(field.values.offset[:2], (moved - END)[:2], atol=0.02)
 
@@ -253,7 +256,7 @@ def test_runs_are_brought_together():
     factor = np.where(run, 0.6 * np.exp(2j), 1.0)
     spread = replace(data, target=(data.target * factor[:, None, None]).astype(np.complex64), run=run * 4 + 1)
     settings = ChannelSettings(directions=False, correlated=False)
-    field, _ = initialise(spread, np.arange(100), settings)
+    field, _ = fitted_to(ChannelField(settings), spread, np.arange(100))
     factors = field.runs.of(torch.tensor([1, 5, 9]))
     np.testing.assert_allclose(factors, [1.0, 0.6 * np.exp(2j), 1.0], atol=0.05)
     assert answer_error(field, data, np.arange(100, 150)) < 0.1
@@ -272,7 +275,7 @@ def test_an_array_that_stands_still_and_one_that_moves():
         h = (np.exp(-1j * K * away) / away)[..., None]
         arrays = {f"{moving}_position": place, f"{static}_position": end, "csi": h, **common}
         data = from_arrays(arrays)
-        field, _ = initialise(data, np.arange(50), ChannelSettings(directions=False))
+        field, _ = fitted_to(ChannelField(ChannelSettings(directions=False)), data, np.arange(50))
         assert "direct" in field.terms, name
         assert len(field.weights) == 3
         assert answer_error(field, data, np.arange(50, 80)) < 0.01, name
@@ -288,18 +291,17 @@ def test_tones_far_apart_are_bands_of_their_own():
 def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
     data = _sent(60)
     field = _whole(data, correlated=True)
-    torch.save(field.state(), tmp_path / "state.pt")
-    again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    again = read_back(field)
     batch = data.batch(np.arange(40, 60))
     with torch.no_grad():
-        before, after = field(batch), again(batch)
+        before, after = field.predict(batch), again.predict(batch)
     for name in ("mean", "variance", "explained", "unknown"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     assert again.terms == field.terms
     with pytest.raises(ValueError, match="not conditioned"):
-        ChannelField(data.site, field.values, (1, 1))(batch)
+        ChannelField.of(data.site, field.values, (1, 1)).predict(batch)
     with pytest.raises(ValueError, match="known carrier"):
-        initialise(replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30), PLAIN)
+        fitted_to(ChannelField(PLAIN), replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30))
 
 
 CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
@@ -311,7 +313,7 @@ def test_measured_channels_in_squares():
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=[5]).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
-    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
+    field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
     plain = ComplexGP()
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.8 * answer_error(plain, data, fold.test)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 from releases import REAL
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
@@ -21,8 +22,8 @@ from gsparc.models.channels.covariance import (
     directional,
     prior,
 )
-from gsparc.models.channels.field import ChannelField, restored
-from gsparc.models.channels.initial import ChannelSettings, initialise
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import sphere
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
@@ -65,7 +66,7 @@ def _tied(data, rows):
     learned = {"power": power, "envelope": envelope, "gain": gain}
     learned["towards"] = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
     learned["offset"] = torch.tensor([0.01, -0.02, 0.0]).double()
-    field = ChannelField(data.site, Values(**shape.state(), **learned), (1, 1))
+    field = ChannelField.of(data.site, Values(**shape.state(), **learned), (1, 1))
     field.condition(data, rows)
     return field
 
@@ -99,7 +100,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 def test_one_field_of_all_ends_is_better_than_plain_processes():
     data = _ceiling(ends=4, count=60, shift=(0.03, -0.02, 0.0))
     fold = fold_of(data)
-    field, notes = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
+    field, notes = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
     assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)
     plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
@@ -110,11 +111,11 @@ def test_one_field_of_all_ends_is_better_than_plain_processes():
 def test_an_end_that_was_never_heard_has_the_direct_wave():
     data = _ceiling(ends=9, turned=0.2)
     known, left = np.flatnonzero(data.station < 7), np.flatnonzero(data.station >= 7)
-    field, _ = initialise(data, known, QUICK)
+    field, _ = fitted_to(ChannelField(QUICK), data, known)
     batch, same = data.batch(left), data.batch(known)
     with torch.no_grad():
-        found = field(batch)
-        of_places = field(Query(batch.tx, batch.rx))
+        found = field.predict(batch)
+        of_places = field.predict(Query(batch.tx, batch.rx))
         torch.testing.assert_close(of_places.mean, found.mean)
         heard = field(same)
     missed = (found.mean - batch.target).abs().square().mean()
@@ -126,10 +127,10 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
 @pytest.mark.slow
 def test_phases_that_nothing_tells_leave_little_to_say_of_an_end():
     data = _ceiling(ends=9, turned=30.0)
-    field, _ = initialise(data, np.flatnonzero(data.station < 7), QUICK)
+    field, _ = fitted_to(ChannelField(QUICK), data, np.flatnonzero(data.station < 7))
     batch = data.batch(np.flatnonzero(data.station >= 7))
     with torch.no_grad():
-        found = field(batch)
+        found = field.predict(batch)
     assert found.unknown.mean() > 0.7
     mean, target = found.mean.flatten().to(torch.complex128), batch.target.flatten().to(torch.complex128)
     one = batch.station == 7
@@ -142,13 +143,13 @@ def test_runs_of_all_ends_differ_by_one_phase():
     runs = np.arange(80) % 2
     data = _ceiling(runs=runs)
     fold = fold_of(data)
-    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), QUICK)
+    field, _ = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
     found = field.runs.factors[1] / field.runs.factors[0]
     torch.testing.assert_close(found.abs(), torch.ones(()).double())
     assert abs(abs(float(found.angle())) - 0.9) < 0.1
     batch = data.batch(fold.test)
     with torch.no_grad():
-        turned = field(Query(batch.tx, batch.rx, batch.station)).mean
+        turned = field.predict(Query(batch.tx, batch.rx, batch.station)).mean
     right = answer_error(field, data, fold.test)
     assert right < 0.5 * nmse(turned.numpy(), batch.target.numpy())
 
@@ -156,11 +157,10 @@ def test_runs_of_all_ends_differ_by_one_phase():
 def test_there_and_back_with_angles_to_ends(tmp_path):
     data = _ceiling()
     field = _tied(data, np.arange(300))
-    torch.save(field.state(), tmp_path / "state.pt")
-    again = restored(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    again = read_back(field)
     batch = data.batch(np.arange(300, 400))
     with torch.no_grad():
-        before, after = field(batch), again(batch)
+        before, after = field.predict(batch), again.predict(batch)
     torch.testing.assert_close(after.mean, before.mean)
     torch.testing.assert_close(after.variance, before.variance)
 
@@ -202,7 +202,7 @@ def test_measured_ceiling_in_squares():
 
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
-    field, _ = initialise(data, np.concatenate([fold.train, fold.val]), ChannelSettings())
+    field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
     plain = for_links(ComplexGP, data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.55 * answer_error(plain, data, fold.test)

@@ -9,17 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
-from gsparc.field.initial import InitSettings
-from gsparc.models import fields
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.image_sources.known.images import counted
-from gsparc.models.powers.field import PowerField, initialise, restored
+from gsparc.models.powers.field import PowerField
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
@@ -59,7 +57,7 @@ def db(power: torch.Tensor) -> np.ndarray:
 def small_field(data: Measurements, two: bool = True) -> PowerField:
     """Invented settings."""
     kernel = Kernel((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel((5.0,), (1.0,), 0.2, 9.0)
-    return PowerField(data.site, Trend(-70.0), kernel)
+    return PowerField.of(data.site, Trend(-70.0), kernel)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
@@ -67,11 +65,11 @@ def test_of_few_rows_it_is_the_plain_process(share):
     data = town(160)
     data = weak(data, share) if share else data
     rows = np.arange(90)
-    field, notes = initialise(data, rows)
+    field, notes = fitted_to(PowerField(), data, rows)
     field.condition(data, rows)
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
     said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
-    told, found = plain.predict(batch), field(batch)
+    told, found = plain.predict(batch), field.predict(batch)
     assert field.count == 0 and found.explained is None and field.terms == ("residual",)
     assert torch.allclose(found.mean, told.mean, rtol=1e-5)
     assert torch.allclose(found.variance, told.variance, rtol=1e-4)
@@ -85,9 +83,7 @@ def blocked(tmp_path_factory):
     data, rows = town(260), np.arange(160)
     file = tmp_path_factory.mktemp("walls") / "town.yaml"
     file.write_text(TOWN_WALL, encoding="utf-8")
-    field, notes = initialise(
-        data, rows, walls=counted(read_walls(file), data.site.origin, data.site.static_position)
-    )
+    field, notes = fitted_to(PowerField(walls=read_walls(file)), data, rows)
     field.condition(data, rows)
     return data, field, notes
 
@@ -95,10 +91,10 @@ def blocked(tmp_path_factory):
 def test_a_known_wall_explains_powers_behind_it(blocked):
     data, field, notes = blocked
     batch = data.batch(np.arange(160, 260))
-    plain, _ = initialise(data, np.arange(160))
+    plain, _ = fitted_to(PowerField(), data, np.arange(160))
     plain.condition(data, np.arange(160))
     truth = db(batch.target)
-    errors = [np.mean((db(f(batch).mean) - truth) ** 2) for f in (field, plain)]
+    errors = [np.mean((db(f.predict(batch).mean) - truth) ** 2) for f in (field, plain)]
     assert field.terms == ("power", "residual") and errors[0] < 0.7 * errors[1], (errors, notes)
 
 
@@ -106,11 +102,11 @@ def test_far_away_the_variance_is_the_priors(blocked):
     data, field, _ = blocked
     near = data.batch(np.arange(5))
     far = Pose(near.rx.position + torch.tensor([0.0, 1e7, 0.0]), near.rx.rotation)
-    there, here = field(Query(near.tx, far)), field(near)
+    there, here = field.predict(Query(near.tx, far)), field.predict(near)
     assert here.unknown.max() < 0.6 and there.unknown.min() > here.unknown.max()
     bare = small_field(data)
     bare.condition(data, np.arange(50))
-    there = bare(Query(near.tx, far))
+    there = bare.predict(Query(near.tx, far))
     prior = 9.0 * (1 + 0.2 + 1)  # the level's own variance is learned, all else is not
     spread = there.variance.sqrt() / (math.log(10) / 10 * there.mean[:, 0])
     assert torch.all(spread.square() > 0.5 * prior) and torch.all(spread.square() <= prior * 1.001)
@@ -126,7 +122,7 @@ def test_left_out_rows_are_predicted_without_them():
     for i in (0, 7, 24):
         field.condition(data, np.delete(rows, i))
         batch = data.batch(np.array([i]))
-        told = field(batch)
+        told = field.predict(batch)
         assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
@@ -142,23 +138,18 @@ def test_both_ends_may_move():
     }
     data = from_arrays(arrays, {"name": "two ends"})
     assert data.site.static_end is None
-    field, _ = initialise(data, np.arange(50))
+    field, _ = fitted_to(PowerField(), data, np.arange(50))
     field.condition(data, np.arange(50))
     batch = data.batch(np.arange(50, 60))
-    assert torch.isfinite(field(batch).mean).all()
+    assert torch.isfinite(field.predict(batch).mean).all()
 
 
 def test_what_cannot_be_is_refused():
     data = town(20)
     with pytest.raises(ValueError, match="at least one row"):
-        initialise(data, np.arange(0))
+        fitted_to(PowerField(), data, np.arange(0))
     with pytest.raises(ValueError, match="condition it first"):
         small_field(data).left_out()
-
-
-def powers_of(data: Measurements, rows: np.ndarray, init: InitSettings) -> PowerField:
-    field, _ = fields.powers(data, rows, init, True, FitContext())
-    return field
 
 
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
@@ -174,9 +165,9 @@ def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
     (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
     batch = data.batch(test)
     errors = []
-    for init in (InitSettings("scene", file=str(tmp_path / "town.yaml")), InitSettings()):
-        field = powers_of(data, rows, init)
-        errors.append(float(np.sqrt(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))))
+    for walls in (read_walls(tmp_path / "town.yaml"), None):
+        field, _ = fitted_to(PowerField(walls=walls), data, rows)
+        errors.append(float(np.sqrt(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))))
     assert errors[0] < 0.75 * errors[1], errors
 
 
@@ -185,16 +176,16 @@ def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch
     rows = np.arange(240)
     field.condition(data, rows)
     batch = data.batch(np.arange(240, len(data)))
-    whole, left = db(field(batch).mean), field.left_out()
+    whole, left = db(field.predict(batch).mean), field.left_out()
     monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
     near = copy.deepcopy(field)
     near.condition(data, rows)
-    assert isinstance(near.process.posterior, Nearest) and near.terms == field.terms
-    assert np.sqrt(np.mean((db(near(batch).mean) - whole) ** 2)) < 0.3
+    assert isinstance(near.powers.posterior, Nearest) and near.terms == field.terms
+    assert np.sqrt(np.mean((db(near.predict(batch).mean) - whole) ** 2)) < 0.3
     assert np.array_equal(near.left_out().rows, left.rows)
     assert np.sqrt(np.mean((db(near.left_out().mean) - db(left.mean)) ** 2)) < 0.4
-    again = restored(data.site, near.state())
-    assert torch.equal(again(batch).mean, near(batch).mean)
+    again = read_back(near)
+    assert torch.equal(again.predict(batch).mean, near.predict(batch).mean)
     assert torch.equal(again.left_out().mean, near.left_out().mean)
 
 
@@ -209,5 +200,5 @@ def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
     monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
     field = small_field(data, two=False)
     field.condition(data, np.arange(300))
-    assert isinstance(field.process.posterior, Nearest) and len(field.at) == 150
-    assert (field.process.posterior.noise[field.at] <= field.process.kernel.noise).all()
+    assert isinstance(field.powers.posterior, Nearest) and len(field.at) == 150
+    assert (field.powers.posterior.noise[field.at] <= field.powers.kernel.noise).all()

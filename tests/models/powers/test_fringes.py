@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
-from gsparc.models.powers.field import initialise, restored
+from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, sampled
 from gsparc.models.powers.waves import basis_of, decibels_of, fit_waves
 from gsparc.ops import Pose
@@ -39,7 +40,7 @@ def db(power: torch.Tensor) -> np.ndarray:
 @pytest.fixture(scope="module")
 def interfering():
     data, rows = plane(500), np.arange(400)
-    field, notes = initialise(data, rows, seed=0)
+    field, notes = fitted_to(PowerField(), data, rows)
     field.condition(data, rows)
     return data, field, notes
 
@@ -65,9 +66,9 @@ def test_powers_are_fitted_by_waves():
 def test_fringes_predict_better_than_the_process_alone(interfering):
     data, field, notes = interfering
     batch = data.batch(np.arange(400, 500))
-    plain, _ = initialise(data, np.arange(400), fringes=False)
+    plain, _ = fitted_to(PowerField(waves=False), data, np.arange(400))
     plain.condition(data, np.arange(400))
-    errors = [np.mean((db(f(batch).mean) - db(batch.target)) ** 2) for f in (field, plain)]
+    errors = [np.mean((db(f.predict(batch).mean) - db(batch.target)) ** 2) for f in (field, plain)]
     assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
 
 
@@ -76,8 +77,8 @@ def test_far_from_all_rows_the_process_is_left_alone(interfering):
     batch = data.batch(np.arange(3))
     far = Pose(batch.rx.position + 100.0, batch.rx.rotation)
     asked = Query(batch.tx, far)
-    there = field(asked)
-    decibels, spread, share = (v.numpy() for v in field.process.answer(asked.places(data.site)))
+    there = field.predict(asked)
+    decibels, spread, share = (v.numpy() for v in field.powers.answer(asked.places(data.site)))
     assert np.allclose(db(there.mean), decibels, atol=1e-4) and np.allclose(there.unknown, share)
     slope = np.log(10) / 10 * there.mean[:, 0].numpy()
     assert np.allclose(there.variance.numpy(), spread * slope**2, rtol=1e-4)
@@ -90,7 +91,7 @@ def test_rows_are_predicted_by_solutions_that_never_saw_them(interfering):
     assert np.array_equal(found.rows, np.arange(400)) and set(fringes.blind) == set(range(5))
     error = db(found.mean) - db(data.targets(found.rows))
     batch = data.batch(np.arange(400))
-    seen = db(field(batch).mean) - db(batch.target)
+    seen = db(field.predict(batch).mean) - db(batch.target)
     assert np.mean(error**2) > np.mean(seen**2)
 
 
@@ -98,24 +99,25 @@ def test_slopes_of_places(interfering):
     data, field, _ = interfering
     batch = data.batch(np.arange(400, 404))
     places = batch.rx.position.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(field(Query(batch.tx, Pose(places, batch.rx.rotation))).mean.sum(), places)
+    (slope,) = torch.autograd.grad(
+        field.predict(Query(batch.tx, Pose(places, batch.rx.rotation))).mean.sum(), places
+    )
     assert torch.isfinite(slope).all() and slope.abs().max() > 0
 
 
 def test_state_makes_it_again(interfering, tmp_path):
     data, field, _ = interfering
-    torch.save(field.state(), tmp_path / "field.pt")
-    again = restored(data.site, torch.load(tmp_path / "field.pt", weights_only=True))
+    again = read_back(field)
     batch = data.batch(np.arange(400, 420))
     for name in ("mean", "variance", "explained", "unknown"):
-        one, other = (getattr(f(batch), name) for f in (field, again))
+        one, other = (getattr(f.predict(batch), name) for f in (field, again))
         assert torch.allclose(one, other, rtol=1e-5), name
     assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
 
 
 def test_few_rows_have_no_fringes():
     data, rows = plane(100), np.arange(100)
-    field, notes = initialise(data, rows)
+    field, notes = fitted_to(PowerField(), data, rows)
     assert field.fringes is None and "too few for" in notes[-1]
 
 
@@ -146,7 +148,7 @@ def test_a_measured_plane():
     test = np.isin(square, np.unique(square)[::5])
     batch, errors = data.batch(np.flatnonzero(test)), []
     for fringes in (True, False):
-        field, _ = initialise(data, np.flatnonzero(~test), fringes)
+        field, _ = fitted_to(PowerField(fringes), data, np.flatnonzero(~test))
         field.condition(data, np.flatnonzero(~test))
-        errors.append(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))
+        errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1], errors

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to, read_back
 from releases import REAL
 
 from gsparc.data.own import from_arrays
@@ -14,7 +15,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.powers.field import PowerField, initialise, restored
+from gsparc.models.powers.field import PowerField
 from gsparc.ops import Pose
 from gsparc.processes import powers
 from gsparc.training.context import FitContext
@@ -53,7 +54,7 @@ def walks(count: int = 160, silent: float = 0.0) -> Measurements:
 
 
 def fitted(data: Measurements, rows: np.ndarray) -> PowerField:
-    field, _ = initialise(data, rows)
+    field, _ = fitted_to(PowerField(), data, rows)
     field.condition(data, rows)
     return field
 
@@ -71,7 +72,7 @@ def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
     known, batch = np.sort(np.concatenate([fold.train, fold.val])), data.batch(fold.test)
     plain = GaussianProcess()
     plain.fit(data, Fold(known, known[:0], fold.test), FitContext())
-    both = [fitted(data, known)(batch).mean, plain.predict(batch).mean]
+    both = [fitted(data, known).predict(batch).mean, plain.predict(batch).mean]
     own, alone = ((db(one) - db(batch.target)).square().mean().sqrt() for one in both)
     assert own < 0.96 * alone, (own, alone)
 
@@ -80,7 +81,7 @@ def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
 def test_a_mixture_is_the_mean_of_its_members(silent):
     data = walks(silent=silent)
     field = fitted(data, np.arange(140))
-    process, batch = field.process, data.batch(np.arange(140, 160))
+    process, batch = field.powers, data.batch(np.arange(140, 160))
     assert process is not None and len(process.members) > 1
     assert np.isclose(sum(share for share, _ in process.members), 1) and process.members[0][0] >= 0.3
     places = batch.places(data.site)
@@ -99,16 +100,16 @@ def test_a_mixture_is_the_mean_of_its_members(silent):
 def test_a_mixture_is_stored_whole(monkeypatch, nearest):
     data = walks()
     rows, batch = np.arange(140), data.batch(np.arange(140, 160))
-    field, _ = initialise(data, rows)
+    field, _ = fitted_to(PowerField(), data, rows)
     monkeypatch.setattr(powers, "MOST_ROWS", 100 if nearest else 6_000)
     for given in (False, True):
         if given:
             field.condition(data, rows)
-        again = restored(data.site, field.state())
+        again = read_back(field)
         if not given:
             again.condition(data, rows)
             field.condition(data, rows)
-        told, found = (one(batch) for one in (field, again))
+        told, found = (one.predict(batch) for one in (field, again))
         assert torch.allclose(told.mean, found.mean, rtol=1e-6)
         assert torch.allclose(told.variance, found.variance, rtol=1e-5)
 
@@ -121,10 +122,10 @@ def test_a_mixture_has_slopes():
     tx, turned = batch.tx.double(), batch.rx.rotation.double()
 
     def mean(at: torch.Tensor) -> torch.Tensor:
-        return 10 * field(Query(tx, Pose(at, turned))).mean.log10()
+        return 10 * field.predict(Query(tx, Pose(at, turned))).mean.log10()
 
     assert torch.autograd.gradcheck(mean, place.requires_grad_(), eps=1e-5, atol=1e-4)
 
 
 def test_few_rows_have_one_process():
-    assert initialise(walks(), np.arange(80))[0].others == ()
+    assert fitted_to(PowerField(), walks(), np.arange(80))[0].others == ()

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.conditional import ConditionalField, LeftOutRows
+from gsparc.data.splits import Fold
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
@@ -30,6 +31,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Shared
+from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
@@ -39,44 +41,90 @@ PLACES = 600  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
-class JointPowerField(ConditionalField):
-    """See `ConditionalField`; targets are linear powers (1,).
+class JointPowerField(ClosedForm, kind="joint_powers"):
+    """Powers of several stations, (1,) linear.
 
     Args:
-        site: of powers, with several stations.
-        places: (T, 3) float64 of the stations [m].
-        own: of the stations' own processes.
-        heard: shared terms for stations that have rows.
-        unheard: those for all others.
-        inflation: of their variances.
-        seed: of rows drawn.
-        network: whose sectors have processes that those of a site share; None: each station has its own.
+        shared: whether they share more than the law.
+        seed: of rows and places that are drawn.
     """
 
-    kind = "joint_powers"
+    name = "process of many stations' powers"
+    both_ends = uses_censored = True
+    site: Site
+    places: np.ndarray  # (T, 3) float64 of the stations [m]
+    own: Own  # of the stations' own processes
+    heard: Terms  # shared terms for stations that have rows
+    unheard: Terms  # those for all others
+    network: Network | None  # whose sectors have processes that those of a site share; None: each has its own
 
-    def __init__(
-        self,
-        site: Site,
-        places: np.ndarray,
-        own: Own,
-        heard: Terms,
-        unheard: Terms,
-        inflation: float = 1.0,
-        seed: int = 0,
-        network: Network | None = None,
-    ) -> None:
-        self.site, self.places, self.own, self.seed, self.network = site, places, own, seed, network
-        self.heard, self.unheard, self.inflation = heard, unheard, inflation
+    def __init__(self, shared: bool = True, seed: int = 0) -> None:
+        self.shared, self.seed = shared, seed
+        self.inflation = 1.0  # of variances of stations never heard
         self.posterior: Shared | None = None
         self.elsewhere: Shared | None = None
         self.whole = 1.0  # variance of what was measured, of all stations [dB^2]
         self.rows: dict[int, Tensor] = {}  # of what was heard of each station
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
 
-    @property
-    def count(self) -> int:
-        """None."""
+    @classmethod
+    def of(cls, site: Site, places: np.ndarray, own: Own, terms: Terms) -> JointPowerField:
+        """One of known settings whose stations share `terms`, to be conditioned."""
+        result = cls()
+        result.site, result.places, result.own, result.network = site, places, own, None
+        result.heard = result.unheard = terms
+        return result
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Learn what stations share and their own processes, and condition on these rows.
+
+        Raises:
+            ValueError: not several stations, or no rows.
+        """
+        budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
+        if data.site.stations is None or len(data.site.stations) < 2:
+            raise ValueError("a process of many stations' powers needs several stations")
+        if not len(rows):
+            raise ValueError("a process of many stations' powers needs at least one row")
+        self.site, self.inflation = data.site, 1.0
+        notes = self._learn(data, rows, budget)
+        self.condition(data, rows)
+        return FitReport(budget.counted.wall, notes, budget.limited_by)
+
+    def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
+        """Set the processes and what they share; what must be said of them."""
+        assert data.site.stations is not None
+        self.places, notes = places_of(data, rows)
+        every = link_rows(data, rows, self.places)
+        self.network = network = network_of(data, self.places)
+        if network is None:
+            self.own, remarks = learn_own(every, self.seed, budget)
+        else:
+            every = by_site(every, network)
+            prior, remarks = learn_network(every, network, data.site.stations.name, self.seed, budget)
+            self.own = Own(prior, {})
+        most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
+        if largest > most:
+            remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
+        assert self.own.never.trend is not None
+        self.heard = self.unheard = Terms.over(every, self.own.never.trend, 1.0, 0, self.seed)
+        if not self.shared or network is not None:
+            return (*notes, *remarks)
+        terms, self.inflation, gain = learn_strength(every, self.own, self.seed, budget)
+        if gain is None:
+            remarks.append("no shared terms: too few stations to leave some out")
+            return (*notes, *remarks)
+        before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
+        remarks.append(
+            f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, "
+            f"{after:.3g} dB with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
+        )
+        if terms.place_db:
+            self.unheard = terms.known_at(every, PLACES, self.seed)
+        return (*notes, *remarks)
+
+    def size(self) -> int:
+        """None: no Gaussians."""
         return 0
 
     @property
@@ -85,20 +133,21 @@ class JointPowerField(ConditionalField):
         return ("power", "residual")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`; silent rows say that powers are below a level."""
+        """See `ClosedForm`; silent rows say that powers are below a level."""
         every = link_rows(data, rows, self.places)
         every = every if self.network is None else by_site(every, self.network)
         used = every.thinned(most_each(len(every.stations)), self.seed)
-        few = used.thinned(UNHEARD_EACH, self.seed)
         self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
-        elsewhere = self.own.given(few, self.unheard, self.seed)
+        elsewhere = self.posterior
+        if self.network is None:  # sites share nothing that is learned here
+            elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = Shared({}, self.own.never, self.unheard.columns, (elsewhere.factor, elsewhere.mean))
         loud = used if used.silent.all() else used.loud
         self.whole = max(float(loud.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
-    def __call__(self, query: Query) -> Prediction:
-        """See `ConditionalField`; (B, 1) linear powers.
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; (B, 1) linear powers.
 
         Without stations, who stands at either end is asked; a negative one was never heard.
 
@@ -144,7 +193,7 @@ class JointPowerField(ConditionalField):
         return mean, covariance, noise
 
     def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`; of rows where something was heard.
+        """See `ClosedForm`; of rows where something was heard.
 
         Raises:
             ValueError: before `condition`.
@@ -161,7 +210,7 @@ class JointPowerField(ConditionalField):
         return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
 
     def state(self) -> dict[str, Any]:
-        """See `ConditionalField`."""
+        """See `Method.state`."""
         heard = {str(number): prior.state() for number, prior in self.own.heard.items()}
         state: dict[str, Any] = {
             "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
@@ -175,6 +224,23 @@ class JointPowerField(ConditionalField):
             for name, one in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
                 state[name] = {"lower": one.factor.lower, "mean": one.mean}
         return state
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
+        never = Prior.read(state["never"])
+        assert never.trend is not None
+        self.own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
+        self.heard, self.unheard = (Terms.read(never.trend, state[name]) for name in ("heard", "unheard"))
+        stored = {name: value.numpy() for name, value in state.get("network", {}).items()}
+        self.network = Network(**stored) if stored else None
+        self.rows = {int(number): rows for number, rows in state["rows"].items()}
+        self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
+        if "processes" in state:
+            processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
+            weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
+            self.posterior = Shared(processes, never, self.heard.columns, weights[0])
+            self.elsewhere = Shared({}, never, self.unheard.columns, weights[1])
 
     def _conditioned(self) -> tuple[Shared, Shared]:
         if self.posterior is None or self.elsewhere is None:
@@ -220,9 +286,8 @@ class JointPowerField(ConditionalField):
 
     def _standing(self, places: Tensor) -> Tensor:
         """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
-        apart, number = torch.cdist(places.detach(), torch.from_numpy(self.places).nan_to_num(math.inf)).min(
-            1
-        )
+        table = torch.from_numpy(self.places).nan_to_num(math.inf)
+        apart, number = torch.cdist(places.detach(), table).min(1)
         return torch.where(apart <= SAME_PLACE_M, number, NEVER)
 
     def _power(self, decibels: Tensor) -> Tensor:
@@ -232,85 +297,3 @@ class JointPowerField(ConditionalField):
 def most_each(stations: int) -> int:
     """Rows of each station whose factors fit into memory together."""
     return min(MOST_EACH, int(math.sqrt(MEMORY / 8 / stations)))
-
-
-def initialise(
-    data: Measurements,
-    rows: np.ndarray,
-    shared: bool = True,
-    seed: int = 0,
-    budget: TimeBudget | None = None,
-) -> tuple[JointPowerField, tuple[str, ...]]:
-    """A field of powers of all stations and what must be said of it; `condition` is to follow.
-
-    Args:
-        data: powers of several stations.
-        rows: (n,) to learn from, at least one.
-        shared: whether there may be any beside the law.
-        seed: of rows and places that are drawn.
-        budget: settings are not learned beyond it.
-
-    Raises:
-        ValueError: not several stations, or no rows.
-    """
-    if data.site.stations is None or len(data.site.stations) < 2:
-        raise ValueError("a field of powers of many ends needs several stations")
-    if not len(rows):
-        raise ValueError("a field of powers needs at least one row")
-    places, notes = places_of(data, rows)
-    every = link_rows(data, rows, places)
-    network = network_of(data, places)
-    if network is None:
-        own, remarks = learn_own(every, seed, budget)
-    else:
-        every = by_site(every, network)
-        prior, remarks = learn_network(every, network, data.site.stations.name, seed, budget)
-        own = Own(prior, {})
-    most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
-    if largest > most:
-        remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-    assert own.never.trend is not None
-    plain = Terms.over(every, own.never.trend, 1.0, 0, seed)
-    field = JointPowerField(data.site, places, own, plain, plain, 1.0, seed, network)
-    if not shared or network is not None:
-        return field, (*notes, *remarks)
-    terms, field.inflation, gain = learn_strength(every, own, seed, budget)
-    if gain is None:
-        remarks.append("no shared terms: too few stations to leave some out")
-        return field, (*notes, *remarks)
-    before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-    remarks.append(
-        f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, {after:.3g} dB "
-        f"with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-    )
-    if terms.place_db:
-        field.unheard = terms.known_at(every, PLACES, seed)
-    return field, (*notes, *remarks)
-
-
-def restored(site: Site, state: dict[str, Any]) -> JointPowerField:
-    """The field whose `state()` this was."""
-    never = Prior.read(state["never"])
-    assert never.trend is not None
-    own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
-    heard, unheard = (Terms.read(never.trend, state[name]) for name in ("heard", "unheard"))
-    stored = {name: value.numpy() for name, value in state.get("network", {}).items()}
-    network = Network(**stored) if stored else None
-    field = JointPowerField(
-        site,
-        state["places"].numpy(),
-        own,
-        heard,
-        unheard,
-        float(state["inflation"]),
-        int(state["seed"]),
-        network,
-    )
-    field.rows = {int(number): rows for number, rows in state["rows"].items()}
-    field.whole = float(state["whole"])
-    if "processes" in state:
-        processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
-        weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
-        field.posterior = Shared(processes, never, heard.columns, weights[0])
-        field.elsewhere = Shared({}, never, unheard.columns, weights[1])
-    return field

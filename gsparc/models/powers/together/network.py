@@ -20,7 +20,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import LinkRows
-from gsparc.processes.censored import ConditionalGaussian, propagate
+from gsparc.processes.censored import Sites
 from gsparc.processes.density import Evidence, walked
 from gsparc.processes.factor import Factor
 from gsparc.processes.prior import Prior
@@ -41,6 +41,7 @@ TURNS, GAINS = torch.arange(-180.0, 180.0, 10.0), torch.arange(-12.0, 12.5, 2.0)
 ROUGH_LOOKS, LOOKS, SETTLED = 150, 40, 1e-5
 ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose covariance is factored
 LEAST_WHOLE = 30  # places that leave no sector out, for settings by these alone
+SHARED_BOUNDS = (0.5, 7.0), (-20.0, 20.0), (-1.0, 1.0), (-1.2, 1.5), (10.0, 40.0), (-6.0, 6.0)  # of `SHARED`
 STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
@@ -178,10 +179,8 @@ def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
         return _misfit(mean, rows, scale.exp()).sum() + _off(shared) + 0.5 * (gains / GAIN_DB).square().sum()
 
     begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(8.0), np.zeros(count)]
-    low = [0.5, -20.0, -1.0, -1.2, 10.0, -6.0]
-    high = [7.0, 20.0, 1.0, 1.5, 40.0, 6.0]
     free = [(-400.0, 400.0)] * bands + [(0.0, 4.0)] + [(-40.0, 40.0)] * count
-    best, _ = walked(objective, [begin], [*zip(low, high, strict=True), *free], ROUGH_LOOKS, SETTLED)
+    best, _ = walked(objective, [begin], [*SHARED_BOUNDS, *free], ROUGH_LOOKS, SETTLED)
     shared, levels, scale, gains = torch.from_numpy(best).split((len(SHARED), bands, 1, count))
     return replace(start, shared=shared.clone(), levels=levels.clone()), gains, float(scale.exp())
 
@@ -225,6 +224,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
     own = [rough.terms(at) * rough.unit for at in places]
     bands, count = len(rough.levels), sum(len(part.index) for part in parts)
+    last: list[list[Sites]] = [[] for _ in parts]
     kinds = own[0].shape[1] // (int(rough.rank.max()) + 1)
     is_gain = torch.arange(own[0].shape[1]) % kinds == 0
 
@@ -242,7 +242,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
         total = _off(shared) + 0.5 * ((at[-7:] - usual[-7:]) / loose[-7:]).square().sum()
         for i, at_ in enumerate(places):
             rest = values[i] - rough.at(at_, shared, levels)
-            total = total + Evidence.apply(covariance(i, at), rest, side[i])  # type: ignore[no-untyped-call]
+            total = total + Evidence.apply(covariance(i, at), rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
     middle = float(np.median(pairs[0].distance.numpy())) or 1.0
@@ -254,20 +254,17 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
         np.log([0.5 * variance, 0.3 * variance, bearing * variance, 0.1 * variance]), math.log(spread),
     ]  # fmt: skip
     usual, loose = torch.from_numpy(start), torch.tensor([1.5] * len(start), dtype=torch.float64)
-    low = [0.5, -20.0, -1.0, -1.2, 10.0, -6.0]
-    high = [7.0, 20.0, 1.0, 1.5, 40.0, 6.0]
     wide = [(-400.0, 400.0)] * bands + [(math.log(middle * 1e-3), math.log(middle * 3))] * 2
     wide += [(math.log(1e-2), math.log(1e3))] * 4 + [(math.log(0.3), math.log(20.0))]
-    best, _ = walked(objective, [start], [*zip(low, high, strict=True), *wide], LOOKS, SETTLED)
+    best, _ = walked(objective, [start], [*SHARED_BOUNDS, *wide], LOOKS, SETTLED)
     at = torch.from_numpy(best)
     shared, levels, lengths, variances, noise, gain = unpacked(at)
     learned = replace(rough, shared=shared.clone(), levels=levels.clone())
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
     for i, at_ in enumerate(places):
-        gram, rest, quiet = covariance(i, at), values[i] - learned.mean(at_), side[i] != 0
+        gram, quiet = covariance(i, at), side[i] != 0
         if quiet.any():
-            known = ConditionalGaussian.of(gram, rest, quiet)
-            gram.diagonal()[quiet] += propagate(known, rest[quiet], side[i][quiet]).variance
+            gram.diagonal()[quiet] += last[i][0].variance
         columns = Factor.of(gram, "raise").whitened(learned.columns(at_))
         precision += columns.T @ columns
     doubt = Factor.of(precision, "raise").root.T

@@ -129,7 +129,7 @@ class Terms:
     def columns(self, places: Tensor) -> Tensor:
         """(n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
         if isinstance(self.trend, Sectors):
-            return places.new_zeros(len(places), 1)  # each site has its own
+            return places.new_zeros(len(places), 0)  # each site has its own
         decades = _decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
         bend = inside.square() + 2 * inside * (decades - inside)

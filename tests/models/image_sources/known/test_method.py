@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaigns import compose
+from closed import fitted_to, read_back
 from rooms import nmse, shoebox
 from shoeboxes import as_arrays
 
 from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import write_own
+from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
-from gsparc.models.fields import INITIALISERS, RESTORED
+from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.training.context import FitContext
 
 ROOM = "room: {size_m: [4.0, 3.0, 2.5], boxes_m: [[[1.6, 1.2, 0.0], [2.0, 1.6, 2.5]]]}"
@@ -30,13 +32,14 @@ def room(tmp_path_factory):
 
 
 def fitted(name: str, data, rows: np.ndarray, **init):
-    settings = InitSettings(name, searches=1, **init)
-    return INITIALISERS[name](data, np.sort(rows), settings, True, FitContext(budget_s=60.0))
+    context = FitContext(budget_s=60.0)
+    method = CANDIDATES[name](InitSettings(name, searches=1, **init), True, True, context)
+    return method, method.fit(data, Fold(np.sort(rows), rows[:0], rows[:0]), context)
 
 
 def missed(field, data, rows: np.ndarray) -> float:
     batch = data.batch(rows)
-    return nmse(field(batch).mean.numpy(), data.targets(rows).numpy())
+    return nmse(field.predict(batch).mean.numpy(), data.targets(rows).numpy())
 
 
 def test_known_walls_tell_all_from_few_rows(room):
@@ -47,14 +50,15 @@ def test_known_walls_tell_all_from_few_rows(room):
     assert missed_here < 0.05
     assert known.terms[:2] == ("phase", "visibility") and known.count > 20
     assert any("occluding boxes" in note for note in report.notes)
-    again = RESTORED["sources"](data.site, known.state())
+    again = read_back(known)
     assert missed(again, data, fold.test) == pytest.approx(missed_here, rel=1e-3)
 
 
 def test_without_visibility_every_image_is_seen_everywhere(room):
     _, data, fold, file = room
     settings = InitSettings("scene", file=str(file), order=1)
-    field, _ = INITIALISERS["scene"](data, fold.train[:40], settings, False, FitContext(budget_s=30.0))
+    field = CANDIDATES["scene"](settings, False, False, FitContext())
+    fitted_to(field, data, fold.train[:40], budget_s=30.0)
     assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count == 7
 
 

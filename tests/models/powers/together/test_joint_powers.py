@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from closed import fitted_to
 from releases import real
 from scenes import fold_of
 
@@ -22,7 +23,7 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc, choose
 from gsparc.models.per_station import for_links
 from gsparc.models.powers.together import field as together
-from gsparc.models.powers.together.field import JointPowerField, initialise, most_each
+from gsparc.models.powers.together.field import JointPowerField, most_each
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.registry import method_class
@@ -162,7 +163,7 @@ def learned():
     data = town()
     fold = fold_of(data, val_fraction=0)
     rows = fold.train
-    field, notes = initialise(data, rows)
+    field, notes = fitted_to(JointPowerField(), data, rows)
     field.condition(data, rows)
     return data, fold, field, notes
 
@@ -171,7 +172,7 @@ def test_what_all_hear_alike_is_found(learned):
     data, fold, field, notes = learned
     assert field.unheard.place_db and not field.heard.place_db, notes
     batch = data.batch(fold.test)
-    found = field(batch)
+    found = field.predict(batch)
     error = db(found.mean) - db(batch.target)
     assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
 
@@ -180,9 +181,9 @@ def test_a_station_never_heard_gains_from_the_others():
     data = town()
     rows = np.flatnonzero(data.station != 3)
     asked = data.batch(np.flatnonzero(data.station == 3))
-    field, notes = initialise(data, rows)
+    field, notes = fitted_to(JointPowerField(), data, rows)
     field.condition(data, rows)
-    found = field(Query(asked.tx, asked.rx))
+    found = field.predict(Query(asked.tx, asked.rx))
     error = db(found.mean) - db(asked.target)
     places = torch.from_numpy(data.moving[asked.index.numpy()])
     still = torch.from_numpy(POSTS[3] - data.site.origin).expand(len(places), 3)
@@ -196,9 +197,9 @@ def test_either_end_may_be_the_station(learned):
     data, fold, field, _ = learned
     batch = data.batch(fold.test[:20])
     turned = Pose(batch.tx, batch.rx.rotation)
-    there, back = field(Query(batch.tx, batch.rx)), field(Query(batch.rx.position, turned))
+    there, back = field.predict(Query(batch.tx, batch.rx)), field.predict(Query(batch.rx.position, turned))
     assert torch.allclose(there.mean, back.mean, rtol=1e-4)
-    assert torch.allclose(there.mean, field(batch).mean, rtol=1e-4)
+    assert torch.allclose(there.mean, field.predict(batch).mean, rtol=1e-4)
 
 
 def test_silent_rows_say_that_powers_are_low():
@@ -211,12 +212,12 @@ def test_silent_rows_say_that_powers_are_low():
     (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
     for used in (rows, rows[~quiet]):
-        field = JointPowerField(data.site, places_of(data, rows)[0], own, terms, terms)
+        field = JointPowerField.of(data.site, places_of(data, rows)[0], own, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
-        errors.append(np.mean((db(field(batch).mean) - db(batch.target)) ** 2))
+        errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1]
-    assert initialise(silent, rows)[1]
+    assert fitted_to(JointPowerField(), silent, rows)[1]
 
 
 def test_a_station_whose_place_nobody_gave():
@@ -224,12 +225,12 @@ def test_a_station_whose_place_nobody_gave():
     gone = data.site.stations.position.copy()
     gone[2] = np.nan
     site = replace(data.site, stations=replace(data.site.stations, position=gone))
-    field, notes = initialise(replace(data, site=site), np.arange(len(data)), shared=False)
+    field, notes = fitted_to(JointPowerField(shared=False), replace(data, site=site), np.arange(len(data)))
     field.condition(replace(data, site=site), np.arange(len(data)))
     assert any("place of station" in note for note in notes)
     assert np.linalg.norm((field.places - data.site.stations.position)[2, :2]) < 40
     batch = replace(data, site=site).batch(np.flatnonzero(data.station == 2)[:5])
-    assert torch.isfinite(field(batch).mean).all()
+    assert torch.isfinite(field.predict(batch).mean).all()
 
 
 def test_rows_are_thinned_at_places_that_stations_share():
@@ -242,14 +243,14 @@ def test_rows_are_thinned_at_places_that_stations_share():
 def test_what_it_refuses():
     data = town()
     with pytest.raises(ValueError, match="several stations"):
-        initialise(replace(data, site=replace(data.site, stations=None)), np.arange(4))
+        fitted_to(JointPowerField(), replace(data, site=replace(data.site, stations=None)), np.arange(4))
     with pytest.raises(ValueError, match="at least one row"):
-        initialise(data, np.arange(0))
+        fitted_to(JointPowerField(), data, np.arange(0))
     with pytest.raises(ValueError, match="stations=each"):
         choose(data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
     own, terms = prior_of(data)
     with pytest.raises(ValueError, match="condition it first"):
-        JointPowerField(data.site, POSTS, own, terms, terms).left_out()
+        JointPowerField.of(data.site, POSTS, own, terms).left_out()
 
 
 def test_gsparc_learns_stations_together(tmp_path):

@@ -1,0 +1,1 @@
+"""A model for other programs: C, channels along a trajectory, DeepMIMO, HTTP."""

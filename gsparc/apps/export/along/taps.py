@@ -1,0 +1,191 @@
+"""Tapped delay lines along a trajectory: a model's channels as taps at whole samples, and their Doppler."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsparc.data.schema import LIGHT
+from gsparc.prediction.channels import Paths
+from gsparc.prediction.predictor import Predictor
+
+PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
+MOST = 50_000  # instants
+CHUNK = 64  # places that the model answers at once
+OCCUPIED = 0.8  # of the sampling rate: the band over which taps are fitted to paths
+FITTED = 512  # tones in it
+SAME = 1e-3  # of the channels' root mean square: paths that are all of them
+RIDGE = 1e-4  # of a tap's energy over the tones: what the band does not hold stays small
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the moving end is when, in straight lines between rows.
+
+    Attributes:
+        time_s: (n,) float64 [s], rising.
+        place: (n, 3) float64 [m, world].
+    """
+
+    time_s: np.ndarray
+    place: np.ndarray
+
+    def __post_init__(self) -> None:
+        if len(self.time_s) < 2 or (np.diff(self.time_s) <= 0).any():
+            raise ValueError("a trajectory needs two rows or more, each later than the one before (time_s)")
+
+    @property
+    def fastest(self) -> float:
+        """[m/s]."""
+        return float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """Places (m, 3) at times (m,)."""
+        return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place.T], 1)
+
+    def instants(self, wavelength: float) -> np.ndarray:
+        """Times (T,), a part of a wavelength apart, at which a channel is to be known; four or more."""
+        length = float(self.time_s[-1] - self.time_s[0])
+        count = max(int(np.ceil(length * self.fastest * PER_WAVE / wavelength)) + 1, 4)
+        if count > MOST:
+            far = f"the trajectory is {length * self.fastest / wavelength:.0f} wavelengths long"
+            raise ValueError(f"{far}, at most {MOST // PER_WAVE} are exported at once; take a part of it")
+        return np.linspace(self.time_s[0], self.time_s[-1], count)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Taps at instants so close that those between can be interpolated.
+
+    The channel at f is the sum over l of `gain exp(-j 2 pi (f - carrier_hz) (first + l) / rate_hz)`.
+
+    Attributes:
+        time_s: (T,) float64 [s].
+        gain: (T, A, L) complex64, physical units.
+        first: delay of the first tap [samples].
+        rate_hz, carrier_hz: of the samples, and the middle of the band [Hz].
+        residual: mean square that taps leave of the model's channels over the band, of these.
+        worst: the same of the worst instant.
+        paths: that the model's channels consist of, with `doppler_hz` (T, A, N); None where it has none.
+    """
+
+    time_s: np.ndarray
+    gain: np.ndarray
+    first: int
+    rate_hz: float
+    carrier_hz: float
+    residual: float
+    worst: float
+    paths: Paths | None = None
+
+    def doppler_hz(self) -> np.ndarray:
+        """Mean Doppler shift (A, L) float64 [Hz] of each tap: the phase it gains from instant to instant."""
+        turned = (self.gain[1:] * self.gain[:-1].conj()).sum(0, dtype=np.complex128)
+        return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
+
+    def path_doppler_hz(self) -> np.ndarray:
+        """Doppler shifts (T, A, N) [Hz] of the paths: how fast their delays shrink."""
+        assert self.paths is not None
+        return -self.carrier_hz * np.gradient(self.paths.delay_s, self.time_s, axis=0)
+
+
+def fitted(
+    predictor: Predictor, way: Trajectory, taps: int, rate_hz: float | None = None, antennas: int = 1
+) -> Line:
+    """Taps of a model's channels along a trajectory, by least squares over the band.
+
+    Over the measured tones, or, where the model's channels are a sum of paths, over `OCCUPIED` of the rate,
+    whatever was measured. The taps stand side by side, where most power arrives.
+
+    Args:
+        predictor, way: of channels with one end that stands still, and of the other end.
+        taps: L; never more than the tones.
+        rate_hz: of samples; None: tones times their spacing.
+        antennas: A, the first of the array's.
+
+    Raises:
+        ValueError: another model, no rate, a band wider than the rate, or silence.
+    """
+    site = predictor.site
+    if site.kind != "csi" or site.static_end is None:
+        raise ValueError("to=taps: channels with one end that stands still are needed")
+    tones = site.tones()
+    if rate_hz is None and len(tones) == 1:
+        raise ValueError(f"rate_hz= is needed: {site.name} was measured at one frequency")
+    rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
+    time_s = way.instants(LIGHT / carrier)
+    places, parts = way.at(time_s), list[Paths]()
+
+    def ask(place: np.ndarray) -> np.ndarray:
+        if early is not None:
+            one = located_paths(predictor, place, antennas)
+            assert one is not None
+            parts.append(one)
+            return one.channel(tones)
+        tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))
+        return predictor.csi(tx, rx)[:, :antennas]
+
+    early: float | None = None
+    look = places[:: max(len(places) // CHUNK, 1)][:CHUNK]
+    known, rays = ask(look), located_paths(predictor, look, antennas)
+    if rays is not None and np.linalg.norm(rays.channel(tones) - known) < SAME * np.linalg.norm(known):
+        tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
+        early = np.floor(rays.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
+        known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
+        parts.clear()
+    if np.ptp(tones) > rate_hz:
+        raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
+    taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
+    first = int(early or 0) + _first(known, turns, taps)
+    columns, solve = _atoms(turns, first, taps)
+    gains, left, power = [], [], []
+    for start in range(0, len(places), CHUNK):
+        channel = ask(places[start : start + CHUNK])
+        gains.append((channel @ solve.T).astype(np.complex64))
+        left.append(np.square(np.abs(gains[-1] @ columns.T - channel)).sum((1, 2)))
+        power.append(np.square(np.abs(channel)).sum((1, 2)))
+    error, total = np.concatenate(left), np.concatenate(power)
+    if not total.all():
+        at = places[int(np.argmin(total))].round(2).tolist()
+        raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
+    paths = None
+    if parts:
+        gain, delay = (np.concatenate([getattr(one, name) for one in parts]) for name in ("gain", "delay_s"))
+        paths = Paths(gain, delay, parts[0].reference_hz)
+    residual = float(error.sum() / total.sum()), float((error / total).max())
+    return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual, paths)
+
+
+def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
+    """Of the first antennas at places (B, 3) [m, world]; None where the model is not made of paths."""
+    try:
+        paths = predictor.paths(**{predictor.site.moving_end: place})
+    except ValueError:
+        return None
+    return replace(paths, gain=paths.gain[:, :antennas], delay_s=paths.delay_s[:, :antennas])
+
+
+def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Taps to tones (K, L), and tones to taps (L, K), at tones (K,) in turns per sample."""
+    columns = np.exp(-2j * np.pi * turns[:, None] * (first + np.arange(taps)))
+    known = columns.conj().T @ columns + RIDGE * len(turns) * np.eye(taps)
+    return columns, np.linalg.solve(known, columns.conj().T)
+
+
+def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
+    """Delay [samples] from which taps hold most of channels (B, A, K); below 0 where that is nearer."""
+    rows = channel.reshape(-1, channel.shape[-1])[:FITTED]
+    if len(turns) == 1:
+        return 0
+    apart = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))  # then delays come again
+    profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(apart)))).sum(0)
+    energy = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
+    middle = int(energy.argmax())
+
+    def residual(first: int) -> float:
+        columns, solve = _atoms(turns, first, taps)
+        return float(np.square(np.abs(rows @ solve.T @ columns.T - rows)).sum())
+
+    best = min(range(middle - 4, middle + 5), key=residual)
+    return best if best < apart / 2 or apart <= taps else best - apart

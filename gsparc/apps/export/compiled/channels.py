@@ -1,0 +1,53 @@
+"""Sums of sources as a compiled form."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gsparc.apps.export.compiled.blob import Form
+from gsparc.data.schema import Site
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.query import Means
+from gsparc.models.image_sources.rows import query_elements, static_array
+from gsparc.ops import Pose
+from gsparc.physics.waves import evenly_spaced
+
+LANES = 16
+BEYOND = 1e6  # [m], a place that is near none
+
+
+def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
+    """Of an ensemble's sources without clutter, whose gains `query` has."""
+    pack, rotation = query.pack, np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    count, rows = len(pack.sources), len(pack.places)
+    outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES
+    weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
+    array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
+    if site.moving_end == "rx":
+        still = Pose(torch.zeros(3), torch.from_numpy(np.asarray(rotation, np.float32)))
+        moving = query_elements(site, still, 1, method.frame.antennas)[0].numpy()
+    images = pack.sources[None]
+    if array is not None:
+        images = images + torch.einsum("kij,ej->eki", pack.orientations, torch.from_numpy(array))
+
+    def padded(value: torch.Tensor, beyond: float = 0.0) -> np.ndarray:
+        return torch.nn.functional.pad(value.float(), (0, wide - rows), value=beyond).numpy()
+
+    tones = torch.from_numpy(site.tones())
+    step = float(tones.diff().mean()) if len(tones) > 1 else 0.0
+    even = len(tones) < 3 or evenly_spaced(tones)
+    combs = [(tones[0], step, len(tones))] if even else [(tone, 0.0, 1) for tone in tones]
+    factors = (method.frame.scale * site.target_scale / method.factors).numpy().astype(np.complex64)
+    arrays = {
+        "middle": method.frame.middle.double().numpy(), "moving": moving.astype(np.float64),
+        "sources": pack.sources.double().numpy(), "images": images.double().numpy(),
+        "offsets": np.zeros(0) if array is None else array.astype(np.float64),
+        "combs": np.array(combs, np.float64), "by_angle": pack.by_angle.flatten().float().numpy(),
+        "by_length": pack.by_length.flatten().float().numpy(), "places": padded(pack.places.T, BEYOND),
+        "towards": padded(pack.towards), "level": (query.level * weight)[:, 0].numpy(),
+        "weights": padded((query.weights * weight).mT), "factors": factors.view(np.float32),
+    }  # fmt: skip
+    still_ends = 1 if array is None else len(array)
+    numbers = [count, rows, outputs, len(moving), still_ends, len(combs), method.frame.carrier_hz]
+    return Form(3, [float(number) for number in numbers], arrays)

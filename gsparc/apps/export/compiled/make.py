@@ -1,0 +1,232 @@
+"""Which compiled form a model is, exactly or distilled, and how far its answers are from the model's."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsparc.apps.export.compiled.blob import Form
+from gsparc.apps.export.compiled.channels import sources_form
+from gsparc.apps.export.compiled.powers import powers_form
+from gsparc.apps.export.compiled.spectra import array_form, process_form, view_form
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.field.frozen import FrozenArray, FrozenView
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.closed_form import ClosedForm
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.image_sources.clutter.blocking import Clutter
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.rows import gather
+from gsparc.models.method import Method
+from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.residual import Residual
+from gsparc.models.per_station import PerStation
+from gsparc.models.powers.field import PowerField
+from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.method import LearnedField
+from gsparc.ops import Pose
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
+
+ANSWERED = {"spectrum": 400, "csi": 1500, "rssi": 3000}  # places that distilled forms are made from
+KEPT = 96  # components of spectra: what a query reads grows with them
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A form and how far it is from its model.
+
+    Attributes:
+        form: to be written.
+        error: over random places, the figure in `FIGURES`; 0: none but rounding.
+        worst: the same of the worst place, those near the end that stands included.
+        summary: in words, for people.
+    """
+
+    form: Form
+    error: float
+    worst: float
+    summary: str
+
+
+# As `gsparc evaluate` has them.
+FIGURES: dict[Kind, str] = {"spectrum": "MSE", "csi": "NMSE", "rssi": "RMSE dB"}
+NEAREST = 1e-3  # of the way to the other end: where the largest errors are looked for
+SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
+
+
+def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled:
+    """The form of a model of one station; its error is measured at `count` random places, and a quarter more
+    near the other end, where powers are largest.
+
+    Raises:
+        ValueError: no form answers as this model does, or it is of several stations.
+    """
+    method, site = predictor.method, predictor.site
+    if isinstance(method, PerStation):
+        assert site.stations is not None
+        raise ValueError(f"station= is needed, one of {', '.join(site.stations.name)}")
+    if site.static_end is None and site.kind != "rssi":
+        raise ValueError(f"{method.name} of two moving ends has no compiled form; only powers have")
+    exact = exact_form(method, site)
+    if exact is not None:
+        return Compiled(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
+    form = distilled_form(predictor, seed)
+    assert form.predictor is not None
+    near = near_places(site, max(1, count // 4), seed + 2)
+    places = np.concatenate([random_places(site, count, seed + 1), near])
+    parts = [_squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)]
+    squared, power = np.concatenate(parts, axis=1)
+    found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
+    error, worst = np.maximum(np.sqrt(found) if site.kind == "rssi" else found, 1e-12).tolist()
+    figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
+    return Compiled(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
+
+
+def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
+    """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
+    own, whole = (answers(one, places).reshape(len(places), -1) for one in (form, model))
+    if model.site.kind == "rssi":
+        whole = np.maximum(whole, 1e-30)
+        own, whole = 10 * np.log10(np.maximum(own / whole, SILENT)), np.zeros_like(whole)
+    squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (own - whole, whole))
+    return np.stack([squared, power if model.site.kind == "csi" else np.ones(len(places))])
+
+
+_ARRAY, _IMAGE, _SUM = "an array's spectrum", "a frozen image", "a sum of sources"
+_NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of processes of powers"}
+
+
+def exact_form(method: Method, site: Site) -> Form | None:
+    """The form whose answers are the model's but for rounding; None where there is none."""
+    if isinstance(method, Gsparc):
+        return exact_form(method.chosen, site)
+    if isinstance(method, NamedMixture):
+        return None if method.only is None else exact_form(method.only, site)
+    if isinstance(method, Residual):
+        return exact_form(method.method, site) if method.rest is None or not method.share else None
+    if isinstance(method, PowerField):
+        if method.powers is None or method.fringes is not None:
+            return None
+        return powers_form(method.powers, site.target_scale)
+    if isinstance(method, ImageProcess) and method._average is not None:
+        return exact_form(method._average[0], site) if not method.size() else None
+    if isinstance(method, LearnedField):
+        return _rendered(method, site)
+    if isinstance(method, GaussianProcess):
+        if method.powers is not None:
+            return powers_form(method.powers, site.target_scale)
+        return process_form(method) if site.kind == "spectrum" else None
+    if isinstance(method, ImageSourceGP):
+        cluttered = any(len(member.scene.clutter) for member in method.members)
+        return None if cluttered else sources_form(method, site, method.query)
+    return None
+
+
+def _rendered(method: LearnedField, site: Site) -> Form | None:
+    if site.kind != "spectrum" or site.static_position is None:
+        return None
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    place = torch.from_numpy(np.asarray(site.static_position, np.float32))
+    frozen = method.frozen_at(Pose(place, torch.from_numpy(np.asarray(rotation, np.float32))))
+    if isinstance(frozen, FrozenArray):
+        return array_form(method.fitted(), frozen)
+    return view_form(frozen) if isinstance(frozen, FrozenView) else None
+
+
+def distilled_form(predictor: Predictor, seed: int) -> Form:
+    """A form near a model: its array's part alone, or a process given its answers at random places.
+
+    Raises:
+        ValueError: channels that are not made of sources.
+    """
+    method, site = predictor.method, predictor.site
+    method = method.chosen if isinstance(method, Gsparc) else method
+    if isinstance(method, ImageProcess) and method._average is not None:
+        own_form = _rendered(method, site)  # without the process that it is averaged with
+        if own_form is not None:
+            alone = copy.copy(method)
+            alone._average = None
+            return replace(own_form, predictor=Predictor(alone, site))
+    sources = _sources_of(method) if site.kind == "csi" else None
+    data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
+    if sources is not None:
+        return _sources_given(sources, data)
+    every = np.arange(len(data))
+    process = GaussianProcess(KEPT)
+    process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
+    form = exact_form(process, site)
+    assert form is not None
+    return replace(form, predictor=Predictor(process, site))
+
+
+def _sources_of(method: Method) -> ImageSourceGP:
+    """The sources of largest weight in a model of channels."""
+    parts = method.parts() if isinstance(method, ClosedForm) else ()
+    for _, one in sorted(parts, key=lambda part: -part[0]):
+        if isinstance(one, ImageSourceGP):
+            return one
+    raise ValueError(
+        f"{method.name}: channels that are not made of image sources have no compiled form "
+        "(model=image_source_gp is made of them)"
+    )
+
+
+def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
+    """The heaviest search's sources without clutter, their gains given a model's answers."""
+    member = method.members[int(torch.as_tensor(method.weights).argmax())]
+    data = replace(data, target=data.target * method.factors.numpy()[:, None])
+    rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.seed))
+    scene = replace(member.scene, clutter=Clutter.none())
+    alone = ImageSourceGP.__new__(ImageSourceGP)
+    alone.__dict__.update(method.__dict__, weights=torch.ones(1))
+    alone._conditioned(rows, [scene])
+    form = sources_form(alone, data.site, alone.query)
+    return replace(form, predictor=Predictor(alone, data.site))
+
+
+def random_places(site: Site, count: int, seed: int) -> np.ndarray:
+    """Local places (count, 3) of what moves, (count, 6) of both ends [m], in the box of the measured."""
+    low, high = site.moving_box
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
+
+
+def near_places(site: Site, count: int, seed: int) -> np.ndarray:
+    """Like `random_places`, the last end nearer to the other, evenly in the logarithm of how much."""
+    places, (low, high) = random_places(site, count, seed), site.moving_box
+    other = places[:, :3] if site.static_end is None else site.static_position
+    if other is None:  # nobody knows where
+        return places
+    share = NEAREST ** np.random.default_rng(seed).uniform(size=(count, 1))
+    places[:, -3:] = (other + share * (places[:, -3:] - other)).clip(low[-3:], high[-3:])
+    return places
+
+
+def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
+    """Local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
+    places = places.astype(np.float64)
+    return {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
+
+
+def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
+    """The model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
+    site = predictor.site
+    parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
+    asked = [{end: at + site.origin for end, at in part.items()} for part in parts]
+    return np.concatenate([predictor.linear(**ends).mean.numpy() for ends in asked])
+
+
+def answered(predictor: Predictor, places: np.ndarray) -> Measurements:
+    """Measurements whose targets are the model's answers at local places [m]."""
+    site, count = predictor.site, len(places)
+    still = np.zeros(3) if site.static_position is None else site.static_position
+    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | ends_at(site, places)
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    return Measurements(
+        site, ends["tx"].astype(np.float64), ends["rx"].astype(np.float64),
+        np.broadcast_to(rotation, (count, 3, 3)), answers(predictor, places) / site.target_scale,
+    )  # fmt: skip

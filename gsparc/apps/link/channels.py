@@ -1,0 +1,134 @@
+"""True and predicted channels of test positions, on any frequencies of the band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.apps.link.adaptation import Band
+from gsparc.data.datasets.argos import FACTS
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.image_sources.phase_offsets import estimate
+from gsparc.models.method import Method, Prediction
+from gsparc.models.uplink.interface import SeparatesPaths
+from gsparc.prediction.channels import interpolated
+from gsparc.prediction.confidence import judged, rivals
+from gsparc.prediction.risk import Evidence
+
+if TYPE_CHECKING:
+    from gsparc.simulate.argos_sim import World
+
+CHUNK = 32
+
+
+@dataclass(frozen=True)
+class Channels:
+    """One band at n positions.
+
+    Attributes:
+        true: (n, A, K) complex64; of simulated streets exact, else interpolated from measured tones.
+        predicted: (n, A, K) complex64.
+        variance: (n,) expected squared error per entry of this very band; NaN where the method gives none.
+        confidence: (n,) the method's own; NaN where it has none.
+        source: where the truth comes from, for the summary.
+    """
+
+    true: Tensor
+    predicted: Tensor
+    variance: Tensor
+    confidence: Tensor
+    source: str
+
+    def of(self, index: np.ndarray) -> Channels:
+        """Some of the positions."""
+        at = torch.from_numpy(index)
+        rest = self.variance[at], self.confidence[at], self.source
+        return Channels(self.true[at], self.predicted[at], *rest)
+
+    def band(self) -> Band:
+        """The first antenna's; what states no variance is taken for exact."""
+        return Band(self.true[:, 0], self.predicted[:, 0], self.variance.nan_to_num(0.0))
+
+
+def channels(
+    method: Method,
+    data: Measurements,
+    rows: np.ndarray,
+    frequency_hz: np.ndarray,
+    antennas: slice = slice(None),
+) -> Channels:
+    """True and predicted channels of rows (n,) at absolute frequencies (K,) [Hz], of some of the antennas.
+
+    Raises:
+        ValueError: a frequency outside the measured band.
+    """
+    assert data.site.subcarriers_hz is not None
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    for start in range(0, len(rows), CHUNK):
+        batch = data.batch(rows[start : start + CHUNK])
+        if isinstance(method, SeparatesPaths) and batch.uplink is not None:
+            wanted = torch.from_numpy(frequency_hz)
+            answer = method.from_uplink_at(batch.uplink, wanted, batch.noise_variance, antennas)
+        else:
+            answer = method.predict(batch)
+            mean = interpolated(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
+            answer = Prediction(mean, answer.variance, answer.unknown)
+        none = torch.full((len(batch),), torch.nan)
+        variance, confidence = (none if x is None else x for x in (answer.variance, answer.confidence))
+        parts.append((answer.mean, variance, confidence))
+    true, source = truth(data, rows, frequency_hz)
+    predicted, variance, confidence = map(torch.cat, zip(*parts, strict=True))
+    return Channels(true[:, antennas], predicted, variance, confidence, source)
+
+
+def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
+    """True channels (n, A, K) in the data's units and frame, and how they were come by."""
+    assert data.site.subcarriers_hz is not None
+    if data.site.name == "argos-sim" and data.uplink is not None:
+        return _of_streets(data, rows, frequency_hz), "rays"
+    measured = data.targets(rows)
+    return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
+
+
+def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+    """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
+    error, own = judged(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
+    return Evidence(rows, data.moving[rows], error, own | rivals(data, fold, rows))
+
+
+@lru_cache(maxsize=1)
+def _streets(*facts: int) -> World:
+    from gsparc.simulate.argos_sim import world
+
+    return world(*facts)
+
+
+def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
+    """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
+    site, uplink = data.site, data.uplink
+    assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
+    assert site.carrier_hz is not None
+    there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
+    heard = uplink[rows].astype(np.complex128) * site.target_scale
+    clean = there.response(site.uplink_hz, rows)
+    coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)
+    # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
+    rest = (coarse.removed(heard, site.uplink_hz, site.carrier_hz) * clean.conj()).sum(1)
+    away = site.uplink_hz - site.uplink_hz.mean()
+    weight = np.abs(rest)
+    middle = np.angle(rest.sum(1, keepdims=True))
+    angle = np.angle(rest * np.exp(-1j * middle))
+    mean = (weight * away).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
+    slope = (weight * (away - mean) * angle).sum(1) / (weight * (away - mean) ** 2).sum(1)
+    level = ((weight * angle).sum(1) / weight.sum(1) - slope * mean[:, 0]) + middle[:, 0]
+    wanted = there.response(frequency_hz, rows)[:, site.antennas]
+    turn = coarse.phase[:, None] - 2 * np.pi * (frequency_hz - site.carrier_hz) * coarse.delay[:, None]
+    turn = turn + level[:, None] + slope[:, None] * (frequency_hz - site.uplink_hz.mean())
+    turned = wanted * np.exp(1j * turn)[:, None] / site.target_scale
+    return torch.from_numpy(turned.astype(np.complex64))

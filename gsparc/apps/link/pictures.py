@@ -1,0 +1,94 @@
+"""Block error rates, throughput and the price of accepting more, drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from gsparc.apps.link.adaptation import Rates
+from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
+from gsparc.prediction.risk import binomial_interval
+
+STYLES = {
+    "perfect@accepted": ("perfect, accepted", "black", "-"),
+    "ls@accepted": ("LS pilots, accepted", GREY, "-"),
+    "lmmse@accepted": ("LMMSE pilots, accepted", PALETTE[2], "-"),
+    "predicted@accepted": ("predicted, accepted", PALETTE[0], "-"),
+    "predicted_variance@accepted": ("predicted with its variance, accepted", PALETTE[3], "-"),
+    "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", PALETTE[6], "-"),
+    "perfect": ("perfect, all", "black", ":"),
+    "lmmse": ("LMMSE pilots, all", PALETTE[2], ":"),
+    "predicted": ("predicted, all", PALETTE[1], ":"),
+    "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
+    "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
+}
+SHORT = {
+    "perfect": ("k-o", "perfect"), "lmmse": ("g-o", "lmmse"), "predicted": ("b-o", "predicted"),
+    "predicted_variance": ("m--o", "predicted with its variance"),
+    "predicted_pilots": ("C5-o", "prediction corrected by pilots"),
+}  # fmt: skip
+RATES = {
+    "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
+    "chosen_bps": ("b--o", "from the predicted one"),
+}  # fmt: skip
+LEAST_RATE = 3e-4
+
+
+def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
+    """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
+    figure, axes = panels(5.6 * len(rates), 8, 2, len(rates), grid=False)
+    for column, (modulation, curves) in enumerate(rates.items()):
+        for name, (label, colour, line) in STYLES.items():
+            if name not in curves:
+                continue
+            curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
+            bler = curve.bler.clip(LEAST_RATE).to_numpy()
+            counts = zip(curve.errors, curve.blocks, strict=True)
+            ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
+            reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
+            style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
+            axes[0, column].errorbar(curve.index, bler, reach, **style_above)
+            axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
+        axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
+        axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
+        for row, what in enumerate(("block error rate", "bit error rate")):
+            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
+            axes[row, column].grid(alpha=0.3, which="both")
+    axes[0, 0].legend(fontsize=7)
+    save(figure, path)
+
+
+def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
+    """Throughput over noise, and the confidence of right and wrong choices."""
+    figure, ((left, right),) = panels(11, 4, 1, 2)
+    for name, (style, label) in RATES.items():
+        mean = [getattr(one, name).mean() / 1e6 for one in rates]
+        left.plot([one.snr_db for one in rates], mean, style, label=label)
+    left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
+    left.legend()
+    middle = rates[len(rates) // 2]
+    miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
+    groups = {name: score[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
+    present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}
+    right.boxplot(list(present.values()), tick_labels=list(present))
+    right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
+    save(figure, path)
+
+
+def draw_acceptance(
+    acceptance: Mapping[str, tuple[float, pd.DataFrame]], threshold_share: float, path: Path
+) -> None:
+    """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
+    figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
+    for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
+        for name in filter(SHORT.__contains__, rates):
+            style, label = SHORT[name]
+            axis.plot(rates.index, rates[name], style, label=label)
+        axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
+        axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
+        axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
+        axis.legend(fontsize=8)
+    save(figure, path)

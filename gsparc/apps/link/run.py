@@ -1,0 +1,141 @@
+"""The experiments on one model: what is sent over which positions, and what came of it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from gsparc.apps.link.adaptation import Rates, Rule
+from gsparc.apps.link.channels import channels, on_band
+from gsparc.apps.link.pusch import RECEIVERS, Pusch, frequency_correlation
+from gsparc.apps.link.study import (
+    acceptance,
+    adapt,
+    beam_facts,
+    curves,
+    pusch_facts,
+    rate_facts,
+    tradeoff,
+    transmit,
+)
+from gsparc.evaluation.open_runs import Opened
+from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.prediction.risk import Guarantee, accept
+
+log = logging.getLogger(__name__)
+
+NEED_VARIANCE = ("predicted_variance", "predicted_pilots")
+SHARES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+
+
+class LinkStudy:
+    """Test positions on which nothing was chosen, and which of them the promise accepts.
+
+    What is accepted is judged on the band that is used: one antenna, the PUSCH grid.
+
+    Args:
+        run: the model and its data.
+        settings: see conf/link.yaml.
+
+    Raises:
+        ValueError: no channels with their frequencies, no such antenna, or receivers that are needed are not
+            asked for.
+    """
+
+    def __init__(self, run: Opened, settings: Mapping[str, Any]) -> None:
+        self.method, self.data, self.fold = run.methods[0], run.data, run.split.folds[0]
+        site, self.antenna, self.shape = run.data.site, int(settings["antenna"]), settings["pusch"]
+        if site.kind != "csi" or site.subcarriers_hz is None:
+            raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
+        site.need_phase("gsparc link")
+        if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
+            raise ValueError(f"antenna={self.antenna}: the target has {antennas}")
+        self.receivers = list(self.shape["receivers"])
+        if {"perfect", "lmmse", "predicted"} - set(self.receivers) or set(self.receivers) - set(RECEIVERS):
+            raise ValueError(
+                f"pusch.receivers={self.receivers}: expected perfect, lmmse and predicted at least"
+            )
+        self.tones, self.mcs = site.subcarriers_hz, settings["mcs"]
+        self.count, self.spacing_hz = (
+            SUBCARRIERS_PER_BLOCK * self.shape["blocks"],
+            1e3 * self.shape["spacing_khz"],
+        )
+        self.one = slice(self.antenna, self.antenna + 1)
+        frequency_hz = centred(float(self.tones.mean()), self.spacing_hz, self.count)
+        grid = channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
+        evidence, promise = (
+            on_band(grid, self.data, self.fold, self.fold.test),
+            Guarantee(**settings["promise"]),
+        )
+        how = settings["confidence"], settings["spatial"], int(settings["seed"])
+        kind, threshold, self.test, aside = accept(evidence, promise, *how)
+        scores = evidence.scores[kind]
+        self.score = scores[self.test]
+        self.accepted = self.score >= threshold.value
+        rows = aside[scores[aside] >= threshold.value]
+        self.aside = rows if len(rows) else aside
+        self.states_variance = bool(grid.variance.isfinite().all())
+        self.grid, bad = grid.of(self.test), promise.bad(evidence.error[self.test])
+        self.facts: dict[str, Any] = {
+            "seed": int(settings["seed"]), "positions": len(self.test), "confidence/kind": kind,
+            "accepted": float(self.accepted.mean()), "promise/alpha": promise.alpha,
+            "promise/delta": promise.delta, "promise/limit_db": promise.limit_db,
+            "promise/bad_among_accepted": float(bad[self.accepted].mean()) if self.accepted.any() else None,
+            "promise/calibrated_on": threshold.accepted, "promise/bound": threshold.bound(promise.delta),
+            "model/states_variance": self.states_variance,
+        }  # fmt: skip
+
+    def beams(self) -> dict[str, Any]:
+        """`beams/*` of all test positions, as nothing of a beam was chosen on any; empty for one antenna."""
+        if self.data.target.shape[1] == 1:
+            return {}
+        every = channels(self.method, self.data, self.fold.test, self.tones)
+        accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
+        return beam_facts(every.true, every.predicted, accepted)
+
+    def rates(self, tick: Callable[[], None]) -> tuple[dict[Rule, list[Rates]], dict[str, Any]]:
+        """Rate adaptation at every noise level and its facts; `tick` is called after each."""
+        if not self.states_variance:
+            text = "%s states no error variance: rates are adapted as if predictions were exact"
+            log.warning(text, self.method.name)
+        own, other = (
+            channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
+            for rows in (self.test, self.aside)
+        )
+        rates = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
+        return rates, rate_facts(rates, self.accepted, self.score)
+
+    def send(
+        self, modulation: str, levels: list[float], tick: Callable[[str], None]
+    ) -> tuple[dict[str, pd.DataFrame], tuple[float, pd.DataFrame], dict[str, Any]]:
+        """`curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]; `tick` is called before each."""
+        begun = time.perf_counter()
+        receivers = [r for r in self.receivers if self.states_variance or r not in NEED_VARIANCE]
+        if len(receivers) < len(self.receivers):
+            missing = ", ".join(r for r in self.receivers if r not in receivers)
+            log.warning("%s states no error variance: left out are %s", self.method.name, missing)
+        heard = self.data.targets(self.fold.train)[:, self.antenna]
+        known = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
+        shape = self.shape
+        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
+        pusch = Pusch(modulation, *how)
+        sizes = shape["coarse"], shape["fine"], shape["batch"]
+        blocks = transmit(pusch, self.grid.band(), levels, sizes, tick)
+        rates, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
+        facts = pusch_facts(modulation, rates)
+        for name in ("perfect", "predicted"):
+            shares = surest[1][name].items()
+            facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
+        trade = tradeoff(blocks, self.score, SHARES)
+        facts |= {f"tradeoff/{modulation}/{name}": value for name, value in trade.items()}
+        facts |= {
+            "pusch/truth": self.grid.source, "pilots/share_of_slot": pusch.pilot_share,
+            "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
+            f"time/pusch_{modulation}_s": time.perf_counter() - begun,
+        }  # fmt: skip
+        return rates, surest, facts

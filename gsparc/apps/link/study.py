@@ -1,0 +1,260 @@
+"""The three experiments of the link and their figures, as flat facts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from gsparc.apps.link.adaptation import Adaptation, Band, Rates, Rule
+from gsparc.apps.link.pusch import Pusch
+from gsparc.prediction.risk import binomial_interval
+
+STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
+FALLBACK = "lmmse"
+LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
+
+
+def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
+    """Where a falling curve over its index first crosses `target`, linear in its logarithm; None: never."""
+    x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
+    for i in range(len(x) - 1):
+        if floor[i] > target >= floor[i + 1]:
+            share = np.log(floor[i] / target) / np.log(floor[i] / floor[i + 1])
+            return float(x[i] + share * (x[i + 1] - x[i]))
+    return None
+
+
+def gain(true: Tensor, predicted: Tensor) -> Tensor:
+    """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
+    weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
+    received = (true * weight.conj()).sum(1).abs().square()
+    single = true.abs().square().mean(1)
+    return received.mean(1) / single.mean(1).clamp_min(1e-30)
+
+
+def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
+    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
+    best = gain(true, true)
+    return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
+
+
+def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
+    """`beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas.
+
+    Positions whose channel is silent have no beam: they are counted in `beams/silent` and left out.
+
+    Args:
+        true, predicted: (n, A, K).
+        accepted: which of the n are.
+    """
+    few = min(8, true.shape[1])
+    loud = true[:, :few].abs().amax((1, 2)) > 0
+    facts: dict[str, Any] = {"beams/positions": len(true), "beams/silent": int((~loud).sum())}
+    true, predicted, accepted = true[loud], predicted[loud], accepted[loud.numpy()]
+    if not len(true):
+        return facts
+    for count in sorted({few, true.shape[1]}):
+        there, guess = true[:, :count], predicted[:, :count]
+        loss = loss_db(there, guess).numpy()
+        best = gain(there, there).mean()
+        own = torch.maximum(gain(there, guess).mean(), LEAST * best)
+        here = {
+            "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * own.log10()),
+            "loss_db": float(10 * (best / own).log10()),
+            "loss_db_mean": float(loss.mean()), "loss_db_max": float(loss.max()),
+            "share_losing_more_than_1_db": float((loss > 1).mean()),
+            "loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
+            **{f"loss_db_p{share}": float(np.quantile(loss, share / 100)) for share in (50, 90, 95, 99)},
+        }  # fmt: skip
+        facts |= {f"beams/{count}/{name}": value for name, value in here.items()}
+    return facts
+
+
+def adapt(
+    band: Band, aside: Band, snr_db: list[float], settings: Mapping[str, Any], tick: Callable[[], None]
+) -> dict[Rule, list[Rates]]:
+    """Rates of both rules at noise levels that put the median position at `snr_db`.
+
+    Args:
+        band: of the positions to be judged.
+        aside: of others, on which care and backoff are chosen.
+        snr_db, settings: see conf/link.yaml.
+        tick: called after each level.
+
+    Raises:
+        ValueError: every position is silent.
+    """
+    loop = Adaptation(
+        float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
+    )
+    median = band.median_power
+    if median <= 0:
+        raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
+    noises = [median / 10 ** (level / 10) for level in snr_db]
+    # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
+    delivered = {
+        c: sum(loop.rates(aside, n, c, "expected").chosen_bps.mean() for n in noises)
+        for c in settings["care"]
+    }
+    care = max(delivered, key=lambda c: delivered[c])
+    rates: dict[Rule, list[Rates]] = {"expected": [], "target": []}
+    for noise in noises:
+        rates["expected"].append(loop.rates(band, noise, care, "expected"))
+        backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
+        rates["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
+        tick()
+    return rates
+
+
+def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+    """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
+
+    `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
+    most; of all positions, of accepted ones, and of all where the others send pilots.
+    """
+    facts: dict[str, Any] = {}
+    for rule, ones in rates.items():
+        for one in ones:
+            stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
+            facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
+    return facts
+
+
+def _rates_of(one: Rates, accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+    chosen, oracle, miss = one.chosen_bps, one.oracle_bps, np.abs(one.chosen - one.oracle)
+    facts: dict[str, Any] = {
+        "oracle_mbps": oracle.mean() / 1e6, "best_mbps": one.best_bps.mean() / 1e6,
+        "chosen_mbps": chosen.mean() / 1e6,
+        "shortfall": _shortfall(chosen, oracle), "shortfall_best": _shortfall(chosen, one.best_bps),
+        # Whoever is not accepted sends pilots, and chooses as the oracle does.
+        "shortfall_with_fallback": _shortfall(np.where(accepted, chosen, oracle), oracle),
+        "exact": float((miss == 0).mean()), "off_by_more_than_2": float((miss > 2).mean()),
+        "tbler": float(one.fails.mean()), "outage": float(one.outage.mean()), "care": one.care,
+    }  # fmt: skip
+    for share in (0.5, 0.7, 0.9):
+        surest = score >= np.quantile(score, 1 - share)
+        facts[f"shortfall_surest_{share:.0%}"] = _shortfall(chosen[surest], oracle[surest])
+    if np.isfinite(one.regret_bps).all():
+        facts |= _by_regret(one)
+    if accepted.any():
+        facts |= {
+            "shortfall_accepted": _shortfall(chosen[accepted], oracle[accepted]),
+            "shortfall_best_accepted": _shortfall(chosen[accepted], one.best_bps[accepted]),
+            "tbler_accepted": float(one.fails[accepted].mean()),
+            "off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
+        }
+    return facts
+
+
+def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:
+    """Share of the oracle's throughput that is missed; None where nothing can be carried."""
+    return float(1 - chosen.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
+
+
+def _by_regret(one: Rates) -> dict[str, float | None]:
+    """`shortfall_calm_<share>`: of the positions whose choice is expected to miss least; `..._fallback`: of
+    all positions when the others send pilots. What a rate needs to know is not how large an error is, but
+    whether it crosses a step."""
+    facts: dict[str, float | None] = {}
+    order = np.argsort(one.regret_bps, kind="stable")
+    for share in np.arange(0.3, 1.01, 0.1):
+        calm = np.zeros(len(order), bool)
+        calm[order[: round(share * len(order))]] = True
+        together = np.where(calm, one.chosen_bps, one.oracle_bps)
+        facts[f"shortfall_calm_{share:.0%}"] = _shortfall(one.chosen_bps[calm], one.oracle_bps[calm])
+        facts[f"shortfall_calm_{share:.0%}_fallback"] = _shortfall(together, one.oracle_bps)
+    return facts
+
+
+def transmit(
+    pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int], tick: Callable[[str], None]
+) -> pd.DataFrame:
+    """Blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
+
+    Args:
+        band: of the positions that blocks are sent over, by turns.
+        sizes: blocks of the coarse look, of a full point, and of a batch.
+        tick: called with what is being done.
+    """
+    coarse, fine, batch = sizes
+    order = np.arange(max(coarse, fine)) % len(band.true)
+    parts = []
+    for level in levels:
+        tick(f"{level:g} dB")
+        parts.append(pusch.run(band, level, order[:coarse], batch))
+        rate = parts[-1].groupby("receiver").failed.mean()
+        worst = max(rate["perfect"], rate["predicted"])  # which may have an error floor
+        if fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]:
+            parts.append(pusch.run(band, level, order[coarse:fine], batch))
+    return pd.concat(parts, ignore_index=True)
+
+
+def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:
+    """Each receiver's curve on all and on accepted positions, and prediction with fallback on all.
+
+    A curve's index is the Eb/N0 [dB], its columns `bler`, `ber` (NaN without a block), `errors`, `blocks`.
+    """
+    parts: dict[str, pd.DataFrame] = {}
+    for name, own in blocks.groupby("receiver", sort=False):
+        parts[str(name)], parts[f"{name}@accepted"] = own, own[accepted[own.position]]
+    pilots = parts[FALLBACK]
+    parts["fallback"] = pd.concat([parts["predicted@accepted"], pilots[~accepted[pilots.position]]])
+    levels, counts = blocks.ebno_db.unique(), {"errors": 0, "blocks": 0}
+    columns = {
+        "bler": ("failed", "mean"), "ber": ("wrong", "mean"), "errors": ("failed", "sum"),
+        "blocks": ("failed", "size"),
+    }  # fmt: skip
+    return {
+        name: part.groupby("ebno_db").agg(**columns).reindex(levels).fillna(counts)
+        for name, part in parts.items()
+    }
+
+
+def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+    """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
+    facts: dict[str, Any] = {}
+    crossings = {name: crossing(curve.bler) for name, curve in rates.items()}
+    for name, curve in rates.items():
+        stem, at = f"pusch/{modulation}/{name}", crossings[name]
+        reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
+        facts[f"{stem}/ebno_at_bler_0.1"] = at
+        facts[f"{stem}/behind_perfect_db"] = None if at is None or reference is None else at - reference
+        for level, row in curve.iterrows():
+            low, high = binomial_interval(int(row.errors), int(row.blocks))
+            point = {key: None if np.isnan(row[key]) else float(row[key]) for key in ("bler", "ber")}
+            point |= {"bler_low": low, "bler_high": high, "blocks": int(row.blocks)}
+            facts |= {f"{stem}/{level:g}dB/{key}": value for key, value in point.items()}
+    return facts
+
+
+def acceptance(
+    blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]
+) -> tuple[float, pd.DataFrame]:
+    """The Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
+
+    Of the surest `shares` of positions by `score` (P,), the index; receivers are the columns.
+    """
+    perfect = blocks[blocks.receiver == "perfect"].groupby("ebno_db", sort=False).failed.mean()
+    level = float(np.log(perfect.clip(1e-3) / 0.1).abs().idxmin())
+    there = blocks[blocks.ebno_db == level]
+    rates = {share: _surest(there, score, share).groupby("receiver").failed.mean() for share in shares}
+    return level, pd.DataFrame(rates).T
+
+
+def tradeoff(blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]) -> dict[str, Any]:
+    """`<share>/behind_db`: dB behind perfect knowledge at 10 % failed blocks, on the surest shares."""
+    facts: dict[str, Any] = {}
+    for share in shares:
+        some = _surest(blocks, score, share).pivot_table("failed", "ebno_db", "receiver", sort=False)
+        own, perfect = (crossing(some[name]) for name in ("predicted", "perfect"))
+        facts[f"{share:.0%}/behind_db"] = None if own is None or perfect is None else own - perfect
+    return facts
+
+
+def _surest(blocks: pd.DataFrame, score: np.ndarray, share: float) -> pd.DataFrame:
+    return blocks[score[blocks.position] >= np.quantile(score, 1 - share)]

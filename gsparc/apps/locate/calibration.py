@@ -1,0 +1,62 @@
+"""How far a field is trusted to say where, from snapshots that it did not learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.search import Looked
+
+TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
+SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
+LOOKS = 160
+
+
+def calibrated(
+    snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
+) -> Trust:
+    """The trust under which places that were held out are most likely, with an area that holds a share.
+
+    All numbers but the level maximise the mean log density at the true places, a proper score; the level is
+    then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
+    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
+    the share of places that are exchangeable with these.
+
+    Args:
+        snapshots: with their likelihoods over cells.
+        places: (n, 3), where they were heard [m, local].
+        share: of places, to be held.
+        start: of the search.
+        blurred: whether errors of recorded places are learned too; without, cells stay as they are.
+    """
+    edge = float(np.max([one.cells.edge.max() for one in snapshots]))
+    count = 4 if blurred else 3
+    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS][:count]).T
+
+    def of(point: np.ndarray) -> Trust:
+        inflation, temperature, tail, *spread = np.exp(np.clip(point, *spans)).tolist()
+        return Trust(inflation, temperature, tail, *(edge * one for one in spread))
+
+    def surprise(point: np.ndarray) -> float:
+        trust = of(point)
+        return -float(
+            np.mean([one.by(trust).at(place) for one, place in zip(snapshots, places, strict=True)])
+        )
+
+    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD][:count])
+    simplex = first + np.vstack([np.zeros(count), np.diag([1.0, -1.5, 1.0, 1.0][:count])])
+    optimum = minimize(
+        surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
+    )
+    return levelled(of(optimum.x), snapshots, places, share)
+
+
+def levelled(trust: Trust, snapshots: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
+    """The trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
+    levels = np.sort([one.by(trust).level(place) for one, place in zip(snapshots, places, strict=True)])
+    rank = int(np.ceil((len(levels) + 1) * share))
+    return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)

@@ -1,0 +1,196 @@
+"""Where snapshots were heard, by the likelihood of a trained field."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from gsparc.apps.locate.calibration import calibrated, levelled
+from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.posterior import Posterior, likeliest
+from gsparc.apps.locate.search import Looked, Unknown, misfit
+from gsparc.apps.locate.site_field import Moments, SiteField
+from gsparc.apps.locate.snapshots import Snapshots, snapshots
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.method import Method
+from gsparc.models.per_station import for_links
+from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
+
+MOST = 3_000  # cells of the coarse grid
+HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
+HALVED = 16  # cells that are halved at a time
+KEPT = 0.9  # of the mass: cells beyond it stay as they are
+LEVELS = 8  # halvings of a cell
+ENOUGH = 32  # cells of one size that hold this mass need not be halved
+KEY = "locate"  # in a checkpoint's `extra`
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where one snapshot was heard.
+
+    Attributes:
+        place: (3,) [m, local], the likeliest.
+        area: length, area or volume that holds it in the promised share of cases [m, m^2, m^3].
+        modes: parts of that area that are apart, each of some mass.
+        posterior: masses of cells.
+        seconds: that it took.
+    """
+
+    place: np.ndarray
+    area: float
+    modes: int
+    posterior: Posterior
+    seconds: float
+
+    @classmethod
+    def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
+        """At a place (3,) [m, local], with the area of cells that hold a mass `level`."""
+        area = float(posterior.cells.size[posterior.within(level)].sum())
+        return cls(place, area, len(posterior.modes(level)), posterior, seconds)
+
+
+@dataclass(frozen=True)
+class Locator:
+    """A field with the places where one can stand.
+
+    Attributes:
+        field: what would be heard.
+        cells: of a coarse grid.
+        unknown: what differs by chance between snapshots.
+        trust: see there.
+        share: of places that an area holds.
+    """
+
+    field: SiteField
+    cells: Cells
+    unknown: Unknown
+    trust: Trust
+    share: float = 0.9
+
+    @classmethod
+    def of(
+        cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
+        cells: Callable[[np.ndarray], Cells], share: float,
+    ) -> Self:  # fmt: skip
+        """Of a method that was trained on rows (n,), with `cells` by their places (n, 3) [m, local].
+
+        Raises:
+            ValueError: both ends move, or the method states no variance.
+        """
+        field = SiteField(method, data.site)
+        return cls(field, cells(data.moving[rows][:, :3]), unknown, trust, share)
+
+    @cached_property
+    def _coarse(self) -> Moments:
+        """Computed once: most of the time of the first snapshot."""
+        return self.field.at(torch.from_numpy(self.cells.centre))
+
+    def look(self, heard: Snapshots, trust: Trust) -> Looked:
+        """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
+        current = Looked(self.cells, misfit(heard, self._coarse, self.unknown))
+        for _ in range(LEVELS):
+            cells = current.cells
+            likely = likeliest(current.log_density(trust), cells.size, KEPT)
+            wide = cells.edge[likely].max(1)
+            likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
+            if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
+                break
+            chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
+            finer = cells.at(chosen).halved()
+            more = misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
+            rest = np.setdiff1d(np.arange(len(cells)), chosen)
+            others = current.misfit.at(torch.from_numpy(rest))
+            current = Looked(cells.at(rest).with_others(finer), others + more)
+        return current
+
+    def locate(self, heard: Snapshots) -> list[Located]:
+        """Each of n snapshots on its own."""
+        self._coarse  # noqa: B018 (not on the first snapshot's bill)
+        results = []
+        for number in range(len(heard)):
+            started = time.perf_counter()
+            posterior = self.look(heard.at(np.array([number])), self.trust).by(self.trust)
+            located = Located.of(posterior, self.trust.level, posterior.peak())
+            results.append(replace(located, seconds=time.perf_counter() - started))
+        return results
+
+
+def trusted(
+    make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, locator: Locator,
+    folds: int, cells: Callable[[np.ndarray], Cells],
+) -> tuple[Trust, int]:  # fmt: skip
+    """How far such a method is trusted, from training places that it left out, and their number.
+
+    The method is made and trained again without each of a few groups (`folds`) of its training rows, cut as
+    the test rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
+    """
+    groups: list[tuple[Locator, Snapshots]] = []
+    rng = np.random.default_rng(context.seed)
+    inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
+    for number, inner in enumerate(inner_folds):
+        log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
+        method = for_links(make, data)
+        method.fit(data, inner, context.within(f"group{number}"))
+        rows = np.union1d(inner.train, inner.val)
+        without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
+        heard = snapshots(data, inner.test)
+        sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        groups.append((without, heard.at(sample)))
+    places = np.concatenate([heard.place for _, heard in groups])
+
+    def looks(trust: Trust) -> list[Looked]:
+        return [
+            without.look(heard.at(np.array([row])), trust)
+            for without, heard in groups
+            for row in range(len(heard))
+        ]
+
+    trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
+    # Which cells are halved depends on the trust: the level is one of cells as they will be.
+    return levelled(trust, looks(trust), places, locator.share), len(places)
+
+
+def trust_state(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
+    """For a checkpoint's `extra`."""
+    return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
+
+
+def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
+    """The trust that `trust_state` held.
+
+    Where nothing was, areas are as wide as the model's own variances say, which is logged.
+
+    Raises:
+        ValueError: it was learned for other settings.
+    """
+    stored = extra.get(KEY)
+    if stored is None:
+        log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
+        return Trust(level=share)
+    before, promised = Unknown(**stored["unknown"]), stored["share"]
+    if (before, promised) != (unknown, share):
+        settings = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
+        raise ValueError(
+            f"the model was calibrated with {settings}: `gsparc locate` calibrates it for other settings"
+        )
+    return Trust(**stored["trust"])
+
+
+def in_world(located: Located, origin: np.ndarray) -> Located:
+    """The same with places in the world's coordinates."""
+    cells = replace(located.posterior.cells, centre=located.posterior.cells.centre + origin)
+    posterior = replace(located.posterior, cells=cells)
+    return replace(located, place=located.place + origin, posterior=posterior)

@@ -1,0 +1,126 @@
+"""What is known of one place: masses of cells, an area that holds it, and how many places it may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.special import logsumexp
+
+from gsparc.apps.locate.cells import Cells
+
+MODE = 0.05  # of the mass, that a further mode has at least
+BLURRED = 0.999  # of the mass: cells beyond it stay as they are
+LEAST = 1e-300
+SHIFTS, NEAR = 20, 0.01  # steps up the density at most, and of a width that the last one is shorter than
+
+
+def likeliest(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
+    """The densest cells (c,) of G that hold a share of the mass, densest first."""
+    order = np.argsort(-log_density, kind="stable")
+    return order[: int(np.searchsorted(np.cumsum((np.exp(log_density) * size)[order]), share)) + 1]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Masses of the cells in which something was heard.
+
+    Places are recorded with errors, so that the density is that of the likelihood after a convolution with a
+    Gaussian: a kernel density of the cells, each as wide as it is itself and as the errors are.
+
+    Attributes:
+        cells: G of them.
+        sharp: (G,) log mass by size of a cell by the likelihood alone, of total mass 1.
+        spread: standard deviation of recorded places along each axis [m].
+    """
+
+    cells: Cells
+    sharp: np.ndarray
+    spread: float = 0.0
+
+    @cached_property
+    def log_density(self) -> np.ndarray:
+        """(G,) log mass by size of a cell, of total mass 1."""
+        if not self.spread:
+            return self.sharp
+        density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        logarithm = np.log(density + LEAST)
+        return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.size))
+
+    @property
+    def mass(self) -> np.ndarray:
+        """Of each cell (G,)."""
+        return np.exp(self.log_density) * self.cells.size
+
+    def at(self, place: np.ndarray) -> float:
+        """Log density at a place (3,) itself, not of its cell."""
+        here = self.cells.holding(place)
+        if not self.spread:
+            return float(self.sharp[here])
+        rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
+        return float(np.log(self._density(place[None])[0] + rest + LEAST))
+
+    def level(self, place: np.ndarray) -> float:
+        """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
+        here, mass = self.at(place), self.mass
+        return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
+
+    @cached_property
+    def _blurred(self) -> np.ndarray:
+        """Whether a cell is one of those that hold nearly all of the mass (G,)."""
+        blurred = np.zeros(len(self.cells), bool)
+        blurred[likeliest(self.sharp, self.cells.size, BLURRED)] = True
+        return blurred
+
+    def _density(self, places: np.ndarray) -> np.ndarray:
+        """Of the cells that are blurred, at places (m, 3)."""
+        return np.asarray(self._parts(places)[0].sum(1))
+
+    def _parts(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""
+        live = self.cells.edge.max(0) > 0
+        centre, edge = (part[self._blurred][:, live] for part in (self.cells.centre, self.cells.edge))
+        precision = 1 / (self.spread**2 + edge**2 / 12)
+        middle = centre.mean(0)
+        near, apart = centre - middle, places[:, live] - middle
+        squared = apart**2 @ precision.T + (near**2 * precision).sum(1) - 2 * apart @ (near * precision).T
+        mass = np.exp(self.sharp[self._blurred]) * self.cells.size[self._blurred]
+        weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
+        return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
+
+    def peak(self) -> np.ndarray:
+        """The likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
+
+        By mean shift, which needs no step length (D. Comaniciu and P. Meer, "Mean shift: a robust approach
+        toward feature space analysis", IEEE TPAMI 24 (2002)).
+        """
+        place, live = self.cells.centre[self.log_density.argmax()].copy(), self.cells.edge.max(0) > 0
+        for _ in range(SHIFTS):
+            part, centre, precision = self._parts(place[None])
+            pull = part[0][:, None] * precision
+            before, place[live] = place[live].copy(), (pull * centre).sum(0) / (pull.sum(0) + LEAST)
+            if np.abs(before - place[live]).max() * np.sqrt(precision.max()) < NEAR:
+                break
+        return place
+
+    def within(self, share: float) -> np.ndarray:
+        """The most likely cells (c,) that hold a share of the mass, most likely first."""
+        return likeliest(self.log_density, self.cells.size, share)
+
+    def modes(self, share: float) -> list[np.ndarray]:
+        """Cells of each connected part of the area that holds a share of the mass, heaviest first."""
+        some = self.within(share)
+        centre, edge = self.cells.centre[some], self.cells.edge[some]
+        pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
+        touch = (np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
+                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)  # fmt: skip
+        pairs = pairs[touch]
+        graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
+        part = connected_components(graph, directed=False)[1]
+        mass = np.bincount(part, self.mass[some])
+        order = [one for one in np.argsort(-mass) if one == mass.argmax() or mass[one] >= MODE]
+        return [some[part == one] for one in order]

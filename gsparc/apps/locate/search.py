@@ -1,0 +1,54 @@
+"""Misfits of snapshots at cells, and what is known of a place by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsparc.apps.locate import likelihood
+from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.likelihood import Misfit, Trust
+from gsparc.apps.locate.posterior import Posterior
+from gsparc.apps.locate.site_field import Moments
+from gsparc.apps.locate.snapshots import Snapshots
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What differs by chance between snapshots.
+
+    Attributes:
+        phase_known: whether channels come in the phase of the trained ones.
+        offset_db: standard deviation of a device's offset [dB], of powers.
+    """
+
+    phase_known: bool = False
+    offset_db: float = 0.0
+
+
+@dataclass(frozen=True)
+class Looked:
+    """One snapshot's misfit at cells that were halved where it fits."""
+
+    cells: Cells
+    misfit: Misfit
+
+    def log_density(self, trust: Trust) -> np.ndarray:
+        """(G,) of total mass 1."""
+        log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.size))
+        return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
+
+    def by(self, trust: Trust) -> Posterior:
+        """What is known of the place."""
+        return Posterior(self.cells, self.log_density(trust), trust.spread)
+
+
+def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
+    """Of snapshots at places; see `gsparc.apps.locate.likelihood`."""
+    if heard.kind == "spectrum":
+        return likelihood.of_spectra(heard.values, there.mean, there.variance)
+    if heard.kind == "csi":
+        return likelihood.of_channels(heard.values, there.mean, there.variance, unknown.phase_known)
+    return likelihood.of_levels(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)

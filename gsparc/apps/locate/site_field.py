@@ -1,0 +1,81 @@
+"""A trained method as a field of snapshots: mean and variance of all that would be heard at a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.apps.locate.snapshots import compared
+from gsparc.data.query import Query
+from gsparc.data.schema import Site
+from gsparc.models.method import Method, suited_threads
+
+CHUNK = 512  # places that are asked about at a time
+DB = 10 / np.log(10)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What would be heard at G places.
+
+    Attributes:
+        mean: (G, P) as in `Snapshots.values`; NaN where a station has no prediction.
+        variance: (G, P) expected squared error of a measurement, of powers in dB^2; of spectra (G, 1).
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+
+class SiteField:
+    """Answers for all stations of a site together.
+
+    Args:
+        method: trained; its predictions have variances.
+        site: what it was trained on.
+
+    Raises:
+        ValueError: both ends move.
+    """
+
+    def __init__(self, method: Method, site: Site) -> None:
+        if site.static_end is None:
+            raise ValueError("locate: both ends move; one that stands still is needed")
+        self.method, self.site = method, site
+        self.count = 1 if site.stations is None else len(site.stations)
+
+    @torch.no_grad()
+    def at(self, places: Tensor) -> Moments:
+        """Of places (G, 3) float64 [m, local].
+
+        Raises:
+            ValueError: the method states no variance.
+        """
+        parts = [self._chunk(chunk) for chunk in places.split(CHUNK)]
+        return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
+
+    def _chunk(self, places: Tensor) -> Moments:
+        site, many = self.site, len(places) * self.count
+        station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
+        query = Query.at(site, places.float().repeat_interleave(self.count, 0), station)
+        with suited_threads(self.method, many):
+            prediction = self.method.predict(query)
+        if prediction.variance is None:
+            raise ValueError(
+                f"locate: {self.method.name} states no variance, and has no likelihood of a place"
+            )
+        mean, variance = compared(prediction.mean), prediction.variance.double()[:, None]
+        if site.kind == "spectrum":
+            return Moments(mean.double(), variance)
+        if site.kind == "rssi":
+            power = mean.double().clamp_min(1e-30)
+            return self._joined(10 * power.log10(), DB**2 * variance / power.square())
+        mean = mean.to(torch.complex128)
+        return self._joined(mean, variance.expand(mean.shape))
+
+    def _joined(self, mean: Tensor, variance: Tensor) -> Moments:
+        """Of rows by place and station (G T, p): (G, T p)."""
+        return Moments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))

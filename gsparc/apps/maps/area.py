@@ -1,0 +1,168 @@
+"""The cells of a map: a rectangle, polygons, or the extent of a floor plan, at one height."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.path import Path as Outline
+
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.geojson import read_shapes
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.blocks import memory
+from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
+from gsparc.data.schema import Site
+from gsparc.prediction.query import usual_heights
+
+CELLS = 20_000  # of a map whose step nobody chose, about
+LEAST = 1e-4  # of a site's width, of a rectangle: in degrees a site is 1e-5 as wide as in metres
+HEIGHT = 1.5  # of a hand, where nothing says another [m]
+BYTES = 4 * 4  # of a cell and station: power, both ends of the interval, expected error
+BYTES_MORE = 8 * 8  # of a cell besides: what pictures and files hold for a while
+SHARE_OF_MEMORY = 0.5  # of the machine's, that a map may take
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square cells, rows from south to north.
+
+    Attributes:
+        x: (nx,) centres [m], world.
+        y: (ny,) likewise.
+        height: of all cells [m], world.
+        step: side of a cell [m].
+        inside: (ny, nx) bool, cells that are asked for.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    height: float
+    step: float
+    inside: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return len(self.y), len(self.x)
+
+    def places(self, cells: np.ndarray | None = None) -> np.ndarray:
+        """World places (n, 3) [m] of `cells` (n,), numbers into the flat map; None: of those inside."""
+        chosen = np.flatnonzero(self.inside) if cells is None else cells
+        row, column = np.divmod(chosen, len(self.x))
+        return np.column_stack([self.x[column], self.y[row], np.full(len(chosen), self.height)])
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper edge [m]."""
+        half = self.step / 2
+        return self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half
+
+
+def grid_of(
+    site: Site | None,
+    area: Any = None,
+    height_m: float | None = None,
+    step_m: float | None = None,
+    plan: FloorPlan | None = None,
+    stations: int = 1,
+) -> Grid:
+    """The cells of a map.
+
+    Args:
+        site: of the model; None before there is one: then an area or a plan says where.
+        area: (x0, y0, x1, y1) [m], world; a GeoJSON file of polygons; None: the plan's extent, or where was
+            measured.
+        height_m: of all cells, world; None: the height at which the moving end was, the middle of several.
+        step_m: side of a cell; None: about `CELLS` of them.
+        plan: beneath the map.
+        stations: layers of each cell, for what memory is needed.
+
+    Raises:
+        DataError: an area that is none, no height, a step that gives no cells, or more than memory holds.
+    """
+    low, high, contains = _outline(site, area, plan)
+    height = _height(site, height_m)
+    width = high - low
+    step = float(np.sqrt(max(float(width.prod()), 1e-12) / CELLS)) if step_m is None else float(step_m)
+    if step_m is not None and not (np.isfinite(step) and step > 0):
+        raise DataError(f"step_m={step_m}: the side of a cell, above 0 metres, is needed")
+    count = np.ceil(width / step - 1e-9)
+    needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
+    if needed > SHARE_OF_MEMORY * memory():
+        raise DataError(
+            f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} "
+            f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
+        )
+    nx, ny = (max(int(n), 1) for n in count)
+    x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))
+    inside = np.ones((ny, nx), bool)
+    if contains is not None:
+        for row in range(ny):  # by rows: a million places at once would be a copy of the map
+            inside[row] = contains(np.column_stack([x, np.full(nx, y[row])]))
+    if not inside.any():
+        raise DataError(f"area={area}: no centre of a cell of {step:g} m lies in it; take a smaller step_m")
+    return Grid(x, y, height, step, inside)
+
+
+def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:
+    """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
+    box = None if site is None else site.moving_box
+    width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
+    if isinstance(area, str | Path):
+        if Path(area).suffix.lower() not in (".geojson", ".json"):
+            raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
+        origin = None if site is None else site.georeference
+        drawn, _ = read_shapes(area, "area", origin, site_m=width)
+        from shapely import contains_xy
+
+        low, high = np.reshape(drawn.bounds, (2, 2))
+        return low, high, lambda places: contains_xy(drawn, places)
+    if area is not None:
+        low, high = _rectangle(area)
+        if (high - low).max() < LEAST * width:
+            fault = f"{(high - low).max():.2g} m wide, the site {width:.3g} m; a rectangle is in metres"
+            raise DataError(f"area={_as_text(area)}: {fault}, polygons of a *.geojson may be in degrees")
+        return low, high, None
+    if plan is not None:
+        corners = plan.corners()
+        return corners.min(axis=0), corners.max(axis=0), Outline(corners).contains_points
+    if site is None:
+        raise DataError("area: nothing says where; give ckpt=FILE, area=[x0,y0,x1,y1] or plan=IMAGE")
+    low, high = site.moving_box[:, -3:][:, :2] + site.origin[:2]
+    margin = 0.02 * max(float((high - low).max()), 1e-6)
+    return low - margin, high + margin, None
+
+
+def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:
+    corners = finite(area)
+    if corners.shape != (4,):
+        raise DataError(f"area={_as_text(area)}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
+    if np.abs(corners).max() > FARTHEST:
+        raise DataError(f"area={_as_text(area)}: {np.abs(corners).max():.3g} is no coordinate in metres")
+    low, high = corners[:2], corners[2:]
+    if not (high > low).all():
+        raise DataError(f"area={_as_text(area)}: is empty; x1 must be above x0 and y1 above y0")
+    return low, high
+
+
+def _as_text(area: Any) -> str:
+    return str(list(area)) if isinstance(area, Sequence) and not isinstance(area, str) else str(area)
+
+
+def _height(site: Site | None, height_m: float | None) -> float:
+    if height_m is not None:
+        if not (np.isfinite(height_m) and abs(height_m) < FARTHEST):
+            raise DataError(f"height_m={height_m}: a finite number of metres is needed")
+        return float(height_m)
+    if site is None:
+        return HEIGHT
+    known = usual_heights(site).get(site.moving_end)
+    if known is not None:
+        return known
+    low, high = site.moving_box[:, -1] + site.origin[2]
+    return float((low + high) / 2)

@@ -1,0 +1,135 @@
+"""What a model does not know yet: covariances of its errors between places, station by station."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsparc.apps.maps.levels import joint_of
+from gsparc.apps.maps.making import levels_at, local_of
+from gsparc.apps.maps.promise import Promise
+from gsparc.data.blocks import evenly
+from gsparc.data.errors import DataError
+from gsparc.models.method import HasJoint, HasProcess
+from gsparc.models.powers.settings import fit_powers
+from gsparc.prediction.predictor import Predictor
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, Rows
+
+BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
+LEARNED = 1000  # predictions that stand for a model without a process of its own
+SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
+SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are alike, where nobody says it
+
+
+@dataclass
+class ErrorCovariance:
+    """Errors at S places, all variances in dB^2.
+
+    Attributes:
+        covariance: (S, S) of the power without a measurement's own noise; changes as places are measured.
+        noise: variance of one measurement.
+        weight: (S,) what held-out blocks say that variances are to be multiplied with.
+    """
+
+    covariance: np.ndarray
+    noise: float
+    weight: np.ndarray
+
+    def measured(self, place: int) -> None:
+        """Condition on a measurement at one of the places."""
+        column = self.covariance[:, place].copy()
+        self.covariance -= np.outer(column, column / (column[place] + self.noise))
+
+    def gains(self, targets: np.ndarray) -> np.ndarray:
+        """What a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
+        explained = (self.weight * targets) @ self.covariance**2
+        return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+
+    def variances(self) -> np.ndarray:
+        """Of a measurement's error at each place (S,), as held-out blocks scale it."""
+        return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+
+
+def unknown_of(
+    predictor: Predictor,
+    places: np.ndarray,
+    stations: Sequence[str],
+    promise: Promise | None,
+    other_end: Sequence[float] | None = None,
+) -> list[ErrorCovariance]:
+    """At world places (S, 3) [m] of every station, by the model's process, or one of what it predicts.
+
+    Held-out blocks of `promise` scale the variances.
+
+    Raises:
+        DataError: the model has neither a process nor known places.
+    """
+    covariances = []
+    joint = joint_of(predictor.method)
+    for name in stations:
+        asking = predictor if predictor.site.stations is None else predictor.at(name)
+        number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
+        if joint is not None:
+            local = places - asking.site.origin
+            covariance, noise = _of_cell(joint, local, number)
+        else:
+            process = asking.method.process() if isinstance(asking.method, HasProcess) else None
+            process = _stand_in(asking, promise, number) if process is None else process
+            local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
+            assert isinstance(process.posterior, Exact)
+            covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
+            noise = process.kernel.amplitude * process.kernel.noise
+        weight = np.ones(len(places))
+        if promise is not None:  # expected squared errors of held-out blocks over the process's variance
+            calibration = promise.calibration()
+            spread = levels_at(asking, places, other_end)[1]
+            far = promise.distance(local[:, -promise.known.shape[1] :], number)
+            inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
+            error = calibration.expected_error(spread, inside, np.full(len(far), number))
+            ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
+            weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
+        covariances.append(ErrorCovariance(covariance, noise, weight))
+    return covariances
+
+
+def _of_cell(joint: HasJoint, local: np.ndarray, number: int) -> tuple[np.ndarray, float]:
+    """Covariance (S, S) of a station's levels at places (S, 3), and the noise of one measurement [dB^2]."""
+    stations = torch.full((len(local),), number)
+    _, covariance, noise = joint.joint(torch.from_numpy(local)[None], stations)
+    return (covariance[0] - noise.diag()).numpy(), float(noise[0])
+
+
+def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
+    """The same where nothing was measured: shadowing about a level nobody knows, alike over
+    `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
+    """
+    length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
+    variance = SHADOWING_DB**2
+    at = torch.from_numpy(places)
+    prior = variance * (Kernel.of_one(length, NOISE).between(at, at) + 1)
+    return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
+
+
+def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
+    """A process of what the model predicts at places it knows."""
+    if promise is None:
+        raise DataError(
+            f"{asking.method.name} states no covariance, and the model does not say where was measured; "
+            "run gsparc map on it first, which stores it"
+        )
+    own = promise.known[promise.station == number]
+    if not len(own):
+        own = promise.known
+    own = own[evenly(len(own), LEARNED)]
+    if own.shape[1] == 6:
+        raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
+    world = own + asking.site.origin
+    level, _ = levels_at(asking, world)
+    good = np.isfinite(level)
+    rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
+    return fit_powers(rows, asking.site, "constant")[0].exact()

@@ -1,0 +1,306 @@
+"""What a map holds, its layers over all stations (which serves, its ratio, its outage), and its files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from scipy.stats import norm
+
+from gsparc.apps.maps.area import Grid
+from gsparc.data.errors import DataError
+from gsparc.data.files import whole_file
+from gsparc.data.links.georeference import Georeference
+
+REFUSED = -1  # of `best_server`
+OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
+OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
+ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """Predictions for the cells of a grid; float32, NaN where they are refused.
+
+    Attributes:
+        grid: the cells, world.
+        stations: (T,) names; one, "", where there is one.
+        power_db: (T, ny, nx) received power.
+        lower_db, upper_db: (T, ny, nx) ends of the interval.
+        expected_error_db: (T, ny, nx) root mean square error.
+        best_server: (ny, nx) int16, number of the strongest station; `REFUSED`.
+        server_chance: (ny, nx) probability that it is, and is above its floor; see `server_chance`.
+        sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
+        outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
+        share: of measurements that the intervals hold; the field alone lies in them more often.
+        calibrated: whether arrays-out blocks say so; else the model's own deviations alone.
+        threshold_db: of `outage`.
+        extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`, `overlap`.
+        places: (n, 2) where was measured, world [m].
+        station_place: (T, 2) world [m], NaN where unknown.
+        notes: what a reader must know, one line each.
+        unit: of all levels.
+        azimuth: (T,) that sectors face [deg from north], NaN of others.
+        bands: (T,) carriers of the stations; () of one.
+    """
+
+    grid: Grid
+    stations: tuple[str, ...]
+    power_db: np.ndarray
+    lower_db: np.ndarray
+    upper_db: np.ndarray
+    expected_error_db: np.ndarray
+    best_server: np.ndarray
+    server_chance: np.ndarray
+    sinr_db: np.ndarray
+    outage: np.ndarray
+    share: float
+    calibrated: bool
+    threshold_db: float
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+    places: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    station_place: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    notes: tuple[str, ...] = ()
+    unit: str = "dB"
+    azimuth: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    bands: tuple[str, ...] = ()
+
+    @property
+    def refused(self) -> np.ndarray:
+        """Cells (ny, nx) bool of the area about which nothing is said."""
+        return self.grid.inside & (self.best_server == REFUSED)
+
+    @property
+    def unsure(self) -> np.ndarray:
+        """Cells (ny, nx) bool whose best server is less likely than not strongest and above its floor."""
+        return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
+
+    def strongest(self, layers: np.ndarray) -> np.ndarray:
+        """Of layers (T, ny, nx), that of each cell's strongest station (ny, nx); NaN where refused."""
+        number = np.maximum(self.best_server, 0).astype(np.int64)
+        chosen = np.take_along_axis(layers, number[None], axis=0)[0]
+        return np.where(self.best_server == REFUSED, np.nan, chosen)
+
+    def raised(self, decibels: float, unit: str) -> FieldMap:
+        """The same map with levels so many decibels higher, which is in another unit."""
+        levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
+        return replace(self, **levels, threshold_db=self.threshold_db + decibels, unit=unit)
+
+    def layer(self, name: str) -> np.ndarray:
+        """One of `ARRAYS` (ny, nx), of the strongest station; NaN where refused."""
+        if name == "best_server":
+            return np.where(self.best_server == REFUSED, np.nan, self.best_server)
+        values = getattr(self, name)
+        return self.strongest(values) if name in OF_STATIONS else values
+
+    def save(self, path: str | Path) -> None:
+        """Write as npz, whole or not at all."""
+        arrays = {
+            "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
+            "inside": self.grid.inside, "stations": np.array(self.stations), "share": np.array(self.share),
+            "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
+            "unit": np.array(self.unit), "bands": np.array(self.bands, str),
+            **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
+        }  # fmt: skip
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def read(cls, path: str | Path) -> FieldMap:
+        """What `save` wrote; without measured places, stations' places and notes, which it does not hold.
+
+        Raises:
+            DataError: no such file, or not one of a map.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            x, y, inside = arrays.pop("x"), arrays.pop("y"), arrays.pop("inside")
+            step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
+            grid = Grid(x, y, float(arrays.pop("height")), step, inside)
+            names = tuple(str(name) for name in arrays.pop("stations"))
+            facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
+            facts["unit"], facts["bands"] = str(arrays.pop("unit", "dB")), tuple(arrays.pop("bands", ()))
+            for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
+                facts[name] = kind(arrays.pop(name))
+        except FileNotFoundError:
+            raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
+        except (KeyError, ValueError, OSError, EOFError, BadZipFile):
+            raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
+        return cls(grid=grid, stations=names, extra=arrays, **facts)
+
+    def figures(self) -> dict[str, float | int | str | None]:
+        """`map/*` for `summary.json`; shares are of the cells that something is said of."""
+        known = self.grid.inside & ~self.refused
+
+        def of(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
+            values = layer[known & np.isfinite(layer)]
+            return float(reduced(values)) if len(values) else None
+
+        power = self.layer("power_db")
+        figures = {
+            "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
+            "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
+            "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
+            "width_db": of(self.strongest(self.upper_db - self.lower_db)),
+            "expected_error_db": of(self.layer("expected_error_db"), _root_mean_square),
+            "threshold_db": self.threshold_db,
+            "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
+        }  # fmt: skip
+        return {f"map/{name}": value for name, value in figures.items()} | {"map/unit": self.unit}
+
+
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+    """`ARRAYS` of a map (ny, nx) about which nothing is said yet."""
+    shapes = {name: (stations, *shape) if name in OF_STATIONS else shape for name in ARRAYS}
+    values = {name: np.full(size, np.nan, np.float32) for name, size in shapes.items()}
+    return values | {"best_server": np.full(shape, REFUSED, np.int16)}
+
+
+def best_server(power_db: np.ndarray) -> np.ndarray:
+    """Number of the strongest of (T, n) powers [dB], (n,) int16; `REFUSED` where none is known."""
+    known = np.isfinite(power_db)
+    number = np.where(known, power_db, -np.inf).argmax(axis=0)
+    return np.where(known.any(axis=0), number, REFUSED).astype(np.int16)
+
+
+def server_chance(
+    power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray,
+    alike: np.ndarray | float = 0.0,
+) -> np.ndarray:  # fmt: skip
+    """Least probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
+
+    Errors are taken for normal; who beats one station is likelier to beat another, so that
+    the product of all is a lower bound (D. Slepian, Bell Syst. Tech. J. 41 (1962)).
+
+    Args:
+        power_db, error_db: predicted, and expected errors; NaN where unknown.
+        usual_db: (T, 2) mean and deviation that a station has where it is unknown; NaN: it is left out there.
+        floor_db: (T,) power below which a station is not told from noise; -inf: any is.
+        alike: (T, n) correlations of errors with the strongest's: sectors of a site share its shadowing.
+
+    Returns:
+        NaN where no power is known.
+    """
+    number, known = best_server(power_db), np.isfinite(power_db)
+    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    mean, spread = power_db[first, cell], error_db[first, cell]
+    rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
+    apart = np.sqrt(np.maximum(spread**2 + wrong**2 - 2 * alike * spread * wrong, 1e-12))
+    beats = np.nan_to_num(norm.cdf((mean - rival) / apart), nan=1.0)
+    beats[first, cell] = norm.cdf((mean - floor_db[first]) / spread)
+    return np.where(number == REFUSED, np.nan, beats.prod(axis=0)).astype(np.float32)
+
+
+def sinr(
+    power_db: np.ndarray, load: np.ndarray, noise_db: float | None, carrier: np.ndarray | None = None
+) -> np.ndarray:
+    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers, within its carrier.
+
+    Args:
+        power_db: NaN where unknown: such a station is taken for silent.
+        load: (T,) share of the time that each transmits while another serves.
+        noise_db: power of the noise, in the unit of the powers; None: interference alone.
+        carrier: (T,) int64; None: all transmit on one.
+
+    Returns:
+        NaN where no power is known, or where there is neither noise nor interference.
+    """
+    linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
+    number = best_server(power_db)
+    first, cell = np.maximum(number, 0), np.arange(linear.shape[1])
+    signal = linear[first, cell]
+    same = True if carrier is None else carrier[:, None] == carrier[first]
+    every = load @ (linear * same) - load[first] * signal
+    noise = 0.0 if noise_db is None else 10 ** (noise_db / 10)
+    rest = np.maximum(every, 0.0) + noise
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = 10 * np.log10(signal / rest)
+    return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
+
+
+def overlapping(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
+    """Stations (n,) within `OVERLAP_DB` of the strongest of (T, n) powers [dB], itself too, on its carrier.
+
+    Returns:
+        NaN where no power is known.
+    """
+    number = best_server(power_db)
+    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    near = (power_db >= power_db[first, cell] - OVERLAP_DB) & (carrier[:, None] == carrier[first])
+    return np.where(number == REFUSED, np.nan, near.sum(0)).astype(np.float32)
+
+
+def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
+    """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
+
+    Raises:
+        DataError: another number of them, an unknown name, or no share.
+    """
+    if isinstance(load, Mapping):
+        wrong = next((name for name in load if name not in stations), None)
+        if wrong is not None:
+            raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
+        load = [load.get(name, 1.0) for name in stations]
+    try:
+        values = np.array(load, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"load={load}: a number from 0 to 1 is needed, or one per station") from None
+    if values.ndim > 1 or values.size not in (1, len(stations)):
+        raise DataError(f"load={load}: one number is needed, or {len(stations)}, one per station")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise DataError(f"load={load}: shares from 0 to 1 are needed")
+    return np.broadcast_to(values, (len(stations),))
+
+
+def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
+    """Whether a GeoTIFF is written; None: where it can be.
+
+    Raises:
+        DataError: it is asked for, and cannot be.
+    """
+    there = find_spec("rasterio") is not None
+    if wanted and origin is None:
+        raise DataError("geotiff=true: positions were in metres about an unknown origin, not in degrees")
+    if wanted and not there:
+        raise DataError("geotiff=true: needs rasterio; pip install 'gsparc[maps]'")
+    return there and origin is not None and wanted is not False
+
+
+def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference) -> None:
+    """Write float32 bands, north up; named, NaN where nothing is said.
+
+    Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
+    `outage`, `best_server` (number of the station), `server_chance`, and then the power of each of several
+    stations. The projection is the one that `Georeference` describes, azimuthal equidistant about its place.
+    """
+    import rasterio
+    from rasterio.transform import from_origin
+
+    bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
+    if len(raster.stations) > 1:
+        bands |= {
+            f"power_db {name}": power for name, power in zip(raster.stations, raster.power_db, strict=True)
+        }
+    left, _, _, high = raster.grid.extent
+    place = (
+        f"+proj=aeqd +lat_0={origin.latitude!r} +lon_0={origin.longitude!r} +datum=WGS84 +units=m +no_defs"
+    )
+    profile = {
+        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": len(bands),
+        "dtype": "float32", "crs": place, "nodata": float("nan"), "compress": "deflate", "tiled": True,
+        "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
+    }  # fmt: skip
+    with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
+        for number, (name, values) in enumerate(bands.items(), 1):
+            file.write(np.flipud(values).astype(np.float32), number)
+            file.set_band_description(number, name)

@@ -1,0 +1,87 @@
+"""Polygons and lines of a GeoJSON file (RFC 7946) in world metres."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.errors import DataError, reason
+from gsparc.data.links.georeference import Georeference
+
+if TYPE_CHECKING:
+    from shapely import LineString
+    from shapely.geometry.base import BaseGeometry
+
+SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
+LINE, POLYGON = 1, 3  # of shapely's types; larger numbers are collections
+
+
+def read_shapes(
+    path: str | Path, key: str, origin: Georeference | None, lines_too: bool = False, site_m: float = 0.0
+) -> tuple[BaseGeometry, list[LineString]]:
+    """Return the union of a file's polygons, and its lines, in metres.
+
+    Coordinates are degrees where the model knows its place on Earth.
+
+    Args:
+        path: `*.geojson` or `*.json`.
+        key: setting that named it, for messages.
+        origin: of the model's metres; None: the file's coordinates are metres themselves.
+        lines_too: whether lines will do where there are no polygons.
+        site_m: width of the site [m], of which everything drawn must not be a speck: it is in degrees then.
+
+    Raises:
+        DataError: no file, no GeoJSON, no such shapes, one without extent, or degrees.
+    """
+    where = f"{key}={path}"
+    if find_spec("shapely") is None:
+        raise DataError(f"{where}: GeoJSON needs shapely: pip install 'gsparc[maps]'")
+    import shapely
+    from shapely.geometry import shape
+
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+        features = [one.get("geometry", one) for one in content.get("features", [content])]
+        with np.errstate(invalid="ignore"):  # NaN is refused below
+            parts = np.array([shape(one) for one in features if one], object)
+    except FileNotFoundError:
+        raise DataError(f"{where}: no such file") from None
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
+    except shapely.errors.ShapelyError as error:
+        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
+    while (shapely.get_type_id(parts) > POLYGON).any():
+        parts = shapely.get_parts(parts)
+    kind = shapely.get_type_id(parts)
+    if not (kind == POLYGON).any() and not (lines_too and (kind == LINE).any()):
+        raise DataError(f"{where}: holds no polygon; draw the area as a Polygon or MultiPolygon")
+    parts, kind = parts[np.isin(kind, (LINE, POLYGON))], kind[np.isin(kind, (LINE, POLYGON))]
+
+    def in_metres(places: np.ndarray) -> np.ndarray:
+        if not np.isfinite(places).all():
+            raise DataError(f"{where}: a corner is NaN or infinite")
+        if origin is not None:
+            try:
+                return origin.from_degrees(places[:, 1], places[:, 0])
+            except DataError as error:
+                raise DataError(f"{where}: {error} (longitude first, then latitude)") from None
+        if np.abs(places).max(initial=0) > FARTHEST:
+            raise DataError(f"{where}: {np.abs(places).max():.3g} is no coordinate in metres")
+        return places
+
+    parts = shapely.transform(parts, in_metres)
+    polygons, lines = parts[kind == POLYGON], parts[kind == LINE]
+    if not ((shapely.area(polygons) > 0).all() and (shapely.length(lines) > 0).all()):
+        raise DataError(f"{where}: an empty polygon or line, its corners enclose nothing")
+    wide = float(np.ptp(shapely.get_coordinates(parts), axis=0).max())
+    if origin is None and wide < SPECK * site_m:
+        raise DataError(
+            f"{where}: all of it is {wide:.2g} m wide, the site {site_m:.3g} m; the model "
+            "was trained in metres about an unknown origin, which degrees mean nothing to"
+        )
+    return shapely.union_all(shapely.make_valid(polygons)), list(lines)

@@ -1,0 +1,292 @@
+"""Intervals that hold a measurement as often as they say, learned from whole blocks of places held out.
+
+The field alone, without the noise of a measurement, lies in them more often.
+A prediction's own deviation is scaled by what it took to cover the errors of held-out rows as far from data
+(split conformal prediction with a scale, J. Lei et al., J. Amer. Stat. Assoc. 113 (2018), in bins of
+distance). Farther than any held-out row nothing is known, and nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+from sklearn.isotonic import IsotonicRegression
+
+LEAST_ROWS = 40  # held out, for any promise
+ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
+MOST_BINS = 8
+PARTS = 5  # of blocks, that are calibrated without by turns
+ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
+REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
+COMPLETED = 100  # passes over censored rows
+TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Rows predicted by models that did not learn from the block of places around them.
+
+    Attributes:
+        level_db: (n,) measured [dB]; of censored rows, the level they lie below or above.
+        mean_db, spread_db: (n,) predicted, and its deviation [dB].
+        distance: (n,) to the nearest place that was learned from [m].
+        block: (n,) int64, rows of one were held out together.
+        station: (n,) int64; 0 where there is one.
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
+    """
+
+    level_db: np.ndarray
+    mean_db: np.ndarray
+    spread_db: np.ndarray
+    distance: np.ndarray
+    block: np.ndarray
+    station: np.ndarray
+    side: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level_db)
+
+    def at(self, rows: np.ndarray) -> Evidence:
+        """Some of them."""
+        return Evidence(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @property
+    def error(self) -> np.ndarray:
+        """Measured less predicted (n,), in deviations; of censored rows what bounds it."""
+        return (self.level_db - self.mean_db) / self.spread_db
+
+    def state(self) -> dict[str, Any]:
+        """For the `extra` of a checkpoint."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, Any]) -> Evidence:
+        """The inverse of `state`."""
+        return cls(*(np.asarray(state[field.name]) for field in fields(cls)))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What scales a prediction's own deviation.
+
+    Attributes:
+        share: of measurements that intervals hold.
+        distance: (K,) middles of bins [m].
+        half: (K,) half of an interval, in deviations.
+        rms: (K,) expected error, in deviations.
+        tail: (Q,) quantiles `TAIL` of errors in expected errors; None where censored rows hide some of them.
+        reach: beyond this distance nothing is said [m].
+        station: (T,) what deviations of each are multiplied with before; of those not among them, 1.
+    """
+
+    share: float
+    distance: np.ndarray
+    half: np.ndarray
+    rms: np.ndarray
+    tail: np.ndarray | None
+    reach: float
+    station: np.ndarray
+
+    def interval(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
+        """Half the interval (n,) [dB] at places of stations (n,); NaN out of reach."""
+        return self._of(self.half, spread_db, distance, station)
+
+    def expected_error(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
+        """Root mean square error (n,) [dB]; NaN out of reach."""
+        return self._of(self.rms, spread_db, distance, station)
+
+    def below(self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
+        """Probability (n,) that a measurement lies below a level; NaN where it is not known."""
+        standard = (level_db - mean_db) / expected_db
+        if self.tail is None:
+            return norm.cdf(standard)
+        chance = np.interp(standard, self.tail, TAIL)
+        return np.where(np.isfinite(standard), chance, np.nan)
+
+    def _of(
+        self, factor: np.ndarray, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
+    ) -> np.ndarray:
+        own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
+        scaled = own * spread_db * np.interp(distance, self.distance, factor)
+        return np.where(distance <= self.reach, scaled, np.nan)
+
+
+def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
+    """Learn the scales; their intervals get no narrower with distance.
+
+    Args:
+        evidence: of held-out rows.
+        share: of measurements that intervals are to hold.
+
+    Raises:
+        ValueError: too few rows.
+    """
+    used = evidence.at(np.flatnonzero(np.isfinite(evidence.error)))
+    heard = used.side == 0
+    if heard.sum() < LEAST_ROWS:
+        raise ValueError(
+            f"{heard.sum()} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"
+        )
+    blocks = len(np.unique(used.block))
+    level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
+    station = _of_stations(used, level)
+    used = replace(used, spread_db=used.spread_db * station[used.station])
+    count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
+    first = [float(part[0]) for part in np.array_split(np.sort(used.distance[heard]), count)[1:]]
+    which = np.searchsorted(first, used.distance, side="right")
+    bins = [used.at(np.flatnonzero(which == number)) for number in range(count)]
+    middle = np.array([float(np.median(one.distance)) for one in bins])
+    spreads = [completed(one) for one in bins]
+    half = np.array([quantiles(np.abs(error), mass, level) for error, mass in spreads])
+    rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
+    typical = np.array([float(np.median(one.spread_db)) for one in bins])
+    weight = np.array([len(one) for one in bins], float)
+    half, rms = (_rising(middle, one * typical, weight) / typical for one in (half, rms))
+    tail = None
+    if heard.all():
+        tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
+        apart = 1e-9 * max(float(np.abs(used.error).max()), 1.0)
+        tail = tail + np.arange(len(tail)) * apart  # no two are equal
+    return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)), station)
+
+
+def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (m,) in deviations and their masses, those of censored rows spread over the errors they allow.
+
+    The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
+    no measured error counts as the least that its own can be in size.
+    """
+    bound, side = evidence.error, evidence.side.astype(np.int64)
+    order = np.argsort(bound, kind="stable")
+    bound, side = bound[order], side[order]
+    heard = bound[side == 0]
+    low, high = heard[[0, -1]] if len(heard) else (np.inf, -np.inf)
+    alone = ((side > 0) & (bound < low)) | ((side < 0) & (bound > high))
+    error = np.where(alone, side * np.minimum(side * bound, 0.0), bound)
+    exact = np.sort(error[(side == 0) | alone])
+    below = np.searchsorted(exact, bound[(side > 0) & ~alone], side="right")
+    above = np.searchsorted(exact, bound[(side < 0) & ~alone], side="left")
+    mass = np.full(len(exact), 1 / len(exact))
+    for _ in range(COMPLETED if len(below) + len(above) else 0):
+        total = np.r_[0.0, np.cumsum(mass)]
+        share = np.zeros(len(exact) + 1)
+        np.add.at(share, below, 1 / total[below])
+        shared = np.cumsum(share[::-1])[::-1][1:]  # an error takes its part of all rows that allow it
+        share[:] = 0.0
+        np.add.at(share, above, 1 / (total[-1] - total[above]).clip(np.finfo(float).tiny))
+        mass = (1 + mass * (shared + np.cumsum(share)[:-1])) / len(bound)
+    return exact, mass
+
+
+def quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+    """Of values (n,) with masses (n,), those below which lie such shares; of equal ones as `np.quantile`."""
+    order = np.argsort(values, kind="stable")
+    before = np.cumsum(mass[order]) - mass[order]
+    return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
+
+
+def _of_stations(used: Evidence, level: float) -> np.ndarray:
+    """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
+
+    def typical(part: Evidence) -> float:
+        error, mass = completed(part)
+        return float(quantiles(np.abs(error), mass, level))
+
+    whole = typical(used)
+    factors = np.ones(int(used.station.max()) + 1)
+    for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
+        own = used.at(np.flatnonzero(used.station == number))
+        if (own.side == 0).sum() >= LEAST_ROWS:
+            blocks = len(np.unique(own.block))
+            ratio = max(typical(own), 1e-3 * whole) / whole
+            factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
+    return factors
+
+
+def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    if len(distance) == 1:
+        return width
+    return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
+
+
+def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Chances (n,) that a measurement lies in its interval, and widths (n,) [dB], NaN where nothing is said.
+
+    Of what was measured they are 0 or 1; a censored row's is that of the errors which its level allows.
+    """
+    half = calibration.interval(evidence.spread_db, evidence.distance, evidence.station)
+    return _inside(calibration, evidence, half), 2 * half
+
+
+def _inside(calibration: Calibration, evidence: Evidence, half: np.ndarray) -> np.ndarray:
+    side, mean = evidence.side, evidence.mean_db
+    expected = calibration.expected_error(evidence.spread_db, evidence.distance, evidence.station)
+    low, high, bound = (
+        calibration.below(level, mean, expected) for level in (mean - half, mean + half, evidence.level_db)
+    )
+    allowed = np.where(side > 0, bound, 1 - bound)
+    both = np.where(side > 0, np.minimum(high, bound) - low, high - np.maximum(low, bound))
+    chance = np.clip(np.divide(both, allowed, out=np.zeros_like(both), where=allowed > 0), 0.0, 1.0)
+    measured = np.abs(evidence.level_db - mean) <= half
+    return np.where(np.isfinite(half), np.where(side == 0, measured, chance), 0.0)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How often a promise held on blocks that its own calibration did not see.
+
+    Attributes:
+        share: of the rows in reach, that lay in their interval.
+        width_db: mean width of intervals [dB].
+        reached: share of all rows that lay in reach.
+        rows, blocks: tried.
+        own_share, own_width_db: of the intervals that the model states by itself.
+        heard_share, silent_share: of the rows with a level, and of those beyond one; NaN of none.
+    """
+
+    share: float
+    width_db: float
+    reached: float
+    rows: int
+    blocks: int
+    own_share: float
+    own_width_db: float
+    heard_share: float
+    silent_share: float
+
+
+def cross_validated(evidence: Evidence, share: float) -> Coverage:
+    """Calibrate on some blocks, try on the others, by turns."""
+    blocks, number = np.unique(evidence.block, return_inverse=True)
+    part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
+    inside, own, width = (np.full(len(evidence), fill) for fill in (0.0, 0.0, np.nan))
+    half = float(norm.ppf((1 + share) / 2)) * evidence.spread_db
+    for turn in range(min(PARTS, len(blocks))):
+        rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
+        calibration, own_part = calibrate(evidence.at(rest), share), evidence.at(tried)
+        inside[tried], width[tried] = covered(calibration, own_part)
+        own[tried] = _inside(calibration, own_part, half[tried])
+    known = np.isfinite(width)
+    return Coverage(
+        float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
+        len(blocks), float(own[known].mean()), float(2 * half[known].mean()),
+        *(float(inside[part].mean()) if part.any() else np.nan
+          for part in (known & (evidence.side == 0), known & (evidence.side != 0))),
+    )  # fmt: skip
+
+
+def distances(
+    known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
+) -> np.ndarray:
+    """From places (n, D) to the nearest of `known` (m, D) of their station, of any where it has none [m]."""
+    distance = np.full(len(places), np.inf)
+    for number in np.unique(station):
+        own = known[known_station == number]
+        chosen = station == number
+        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
+    return distance

@@ -1,0 +1,369 @@
+"""A map of a model: every cell of an area is asked about, in chunks of bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.intervals import Calibration
+from gsparc.apps.maps.levels import MAPPED, cells_of, joint_of, predicted
+from gsparc.apps.maps.promise import Promise, stored_promise
+from gsparc.apps.maps.refining import refined
+from gsparc.data.errors import DataError
+from gsparc.data.executor import each
+from gsparc.data.instantiate import suggest
+from gsparc.data.limits import finite
+from gsparc.data.links.stations import station_number
+from gsparc.data.schema import End, Site
+from gsparc.data.units import PowerUnit
+from gsparc.models.method import HasJoint, HasPaths
+from gsparc.prediction.predictor import Predictor
+
+CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
+ALL_CELLS = 40_000  # of a map that are all asked about
+BANDS = 1 << 16  # cells at a time of what follows from predictions
+OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
+
+
+def map_of(
+    predictor: Predictor, area: Any = None, *, height_m: float | None = None, step_m: float | None = None,
+    threshold_db: float = -100.0, stations: Sequence[str | int] | None = None,
+    load: float | Sequence[float] | Mapping[str, float] = 1.0, noise_db: float | None = None,
+    other_end: Sequence[float] | None = None, plan: FloorPlan | None = None,
+    promise: Promise | Literal["stored"] | None = "stored", share: float = 0.9, tolerance_db: float = 0.1,
+    unit: str | None = None, dry: bool = False,
+) -> FieldMap:  # fmt: skip
+    """Predict every cell of an area.
+
+    >>> field = map_of(gsparc.load("model.ckpt"), step_m=0.5)
+    >>> len(field.power_db), bool(0 <= field.outage.mean() <= 1)
+    (1, True)
+
+    Args:
+        predictor: of powers or channels.
+        area, height_m, step_m: see `grid_of`.
+        threshold_db: of outage.
+        stations: names or numbers; None: all that the model can answer for.
+        load, noise_db: see `sinr`.
+        other_end: (3,) world place of the end that the map is not of, where both moved [m].
+        plan: beneath the map.
+        promise: evidence of held-out blocks, or what the checkpoint holds of it; None: intervals are the
+            model's own deviations, and nothing is refused.
+        share: of measurements that intervals are to hold.
+        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
+            every cell. Known places must be stored with the model.
+        unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as measured.
+        dry: predict one cell of each station alone: whether everything asked for is possible.
+
+    Raises:
+        DataError: anything wrong with what is asked for.
+    """
+    site = predictor.site
+    if site.kind not in MAPPED:
+        raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
+    promise = stored_promise(predictor.extra) if promise == "stored" else promise
+    names, notes = answering(predictor, stations, promise)
+    grid = grid_of(site, area, height_m, step_m, plan, len(names))
+    load_of = loads(load, names)
+    level = PowerUnit.of(unit, site.level_unit, levels=True)
+    threshold_db -= level.raised_db
+    noise_db = None if noise_db is None else noise_db - level.raised_db
+    if dry:
+        first = np.zeros_like(grid.inside)
+        first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
+        grid, promise = replace(grid, inside=first), None
+    calibration = own_deviations(share) if promise is None else promise.calibration(share)
+    values = empty(len(names), grid.shape)
+    stride = _stride(grid, promise, tolerance_db)
+    numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
+    every, computed = np.flatnonzero(grid.inside), 0
+    joint = joint_of(predictor.method)
+    alike = np.zeros_like(values["power_db"])
+    size = len(names) if joint is not None else 1  # stations that are asked about at once
+    for row in range(0, len(names), size):
+        chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
+        ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
+        parts, count = refined(ask, grid.inside, stride, tolerance_db)
+        parts = parts.reshape(-1, size, *grid.shape)
+        values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
+        alike[chosen] = parts[2] if joint is not None else 0.0
+        computed += count * size
+    if computed < len(names) * len(every):
+        notes.append(
+            f"{computed} of {len(names) * len(every)} predictions were made, the others interpolated "
+            f"within about {tolerance_db:g} dB"
+        )
+    bands = bands_of(site, numbers)
+    carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
+    usual, floor = _usual(promise, numbers, noise_db)
+    flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
+    overlap, errors_alike = np.full(grid.inside.size, np.nan, np.float32), alike.reshape(len(names), -1)
+    for cells in _chunks(every, BANDS):
+        mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
+        far = np.zeros(mean.shape)
+        if promise is not None:
+            local = local_of(site, grid.places(cells), other_end, site.static_end is None)
+            far = np.stack([promise.distance(local, number) for number in numbers])
+        half = calibration.interval(spread, far, numbers[:, None])
+        first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
+        error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
+        power, error = mean.astype(np.float32), error.astype(np.float32)
+        best = best_server(power)
+        strongest = np.maximum(best, 0), np.arange(len(best))
+        part = {
+            "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
+            "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),
+            "server_chance": server_chance(
+                power, error, usual, floor, np.where(first == best, errors_alike[:, cells], 0.0)
+            ),
+            "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
+        }  # fmt: skip
+        for name, layer in part.items():
+            flat[name][..., cells] = layer
+        overlap[cells] = overlapping(power, carrier)
+    if promise is not None and not np.isfinite(values["power_db"]).any():
+        raise DataError(
+            f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
+            "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
+        )
+    extra = _path_layers(predictor, grid, values["best_server"])
+    if len(names) > 1:
+        extra["overlap"] = overlap.reshape(grid.shape)
+    known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
+    return FieldMap(
+        grid, tuple(names), **values, share=share, calibrated=promise is not None,
+        threshold_db=threshold_db, extra=extra, bands=bands,
+        places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
+        azimuth=azimuths_of(site, numbers), unit=site.level_unit,
+    ).raised(level.raised_db, level.name)  # fmt: skip
+
+
+def own_deviations(share: float) -> Calibration:
+    """Intervals and errors as the model states them, everywhere."""
+    half = np.array([norm.ppf((1 + share) / 2)])
+    return Calibration(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
+
+
+def answering(
+    predictor: Predictor,
+    wanted: Sequence[str | int] | None,
+    promise: Promise | None = None,
+    key: str = "stations",
+) -> tuple[list[str], list[str]]:
+    """Names of the stations that are mapped, and notes on the others.
+
+    Those are stations that the model does not answer for, and, where something is promised, stations that it
+    never heard: what was held out tells nothing of them. `key` is the setting that `wanted` comes from.
+
+    Raises:
+        DataError: one of them was asked for, or none is left.
+    """
+    stations = predictor.site.stations
+    if stations is None:
+        if wanted is not None:
+            raise DataError(
+                f"{key}={list(wanted)}: the model of {predictor.site.name} has no stations; leave it out"
+            )
+        return [""], []
+    names: list[str] = []
+    for one in wanted if wanted is not None else stations.name:
+        number = station_number(one, stations.name, len(stations))
+        if number is None:
+            raise DataError(f"{key}: no station {one!r}{suggest(str(one), stations.name)}")
+        names.append(stations.name[number])
+    if not names:
+        raise DataError("stations=[]: name one at least, or all")
+    notes = []
+    for name in dict.fromkeys(names):
+        try:
+            predictor.at(name)
+            if promise is not None and not (promise.station == stations.name.index(name)).any():
+                raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
+        except ValueError as error:
+            if wanted is not None:
+                raise DataError(str(error)) from None
+            notes.append(f"left out: {error}")
+            names.remove(name)
+    if not names:
+        raise DataError(notes[0])
+    return list(dict.fromkeys(names)), notes
+
+
+def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
+    return [rows[start : start + size] for start in range(0, len(rows), size)]
+
+
+def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
+    """Cells between those that are asked about everywhere: no farther apart than what was measured."""
+    if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
+        return 1
+    places = np.unique(promise.known[:, -3:-1], axis=0)
+    if len(places) < 2:
+        return 1
+    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
+
+
+def _asker(
+    predictor: Predictor, joint: HasJoint | None, grid: Grid, other: Sequence[float] | None,
+    names: Sequence[str], numbers: np.ndarray,
+) -> Callable[[np.ndarray], np.ndarray]:  # fmt: skip
+    """Levels and deviations [dB] of cells (n,), in chunks, as many at once as torch has threads.
+
+    Of one station (n, 2), or of those that `joint` knows together (n, 3 T), with the correlation of their
+    errors with the strongest's.
+    """
+    own = predictor if joint is not None or predictor.site.stations is None else predictor.at(names[0])
+
+    def one(cells: np.ndarray) -> np.ndarray:
+        if joint is not None:
+            return cells_of(joint, own.site, grid.places(cells), numbers).reshape(len(cells), -1)
+        return np.column_stack(levels_at(own, grid.places(cells), other))
+
+    name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
+
+    def ask(cells: np.ndarray) -> np.ndarray:
+        levels, parts = (
+            np.zeros((len(cells), 2 if joint is None else 3 * len(numbers))),
+            _chunks(cells, CHUNK),
+        )
+        for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
+            levels[number * CHUNK : number * CHUNK + len(values)] = values
+        return levels
+
+    return ask
+
+
+def levels_at(
+    predictor: Predictor,
+    places: np.ndarray,
+    other: Sequence[float] | None = None,
+    station: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
+    parts = []
+    for part in _chunks(places, CHUNK):
+        ends = ends_of(predictor.site, part, other, station)
+        parts.append(predicted(predictor.linear(**ends), predictor.site.kind))
+    level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return level, spread
+
+
+def ends_of(
+    site: Site, places: np.ndarray, other: Sequence[float] | None, station: np.ndarray | None = None
+) -> dict[End, np.ndarray]:
+    """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
+
+    `other` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
+
+    Raises:
+        DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
+    """
+    if station is not None and site.static_end is not None:
+        return {site.static_end: station, site.moving_end: places}
+    if site.static_end is not None:
+        if other is not None:
+            raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
+        return {site.moving_end: places}
+    if other is None:
+        raise DataError(OTHER_END)
+    return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
+
+
+def place_of(name: str, value: Any) -> np.ndarray:
+    """(3,) [m] of the setting `name`; `DataError` where it is no place."""
+    place = finite(value)
+    if place.shape != (3,):
+        raise DataError(f"{name}={value}: three finite numbers [m] are needed")
+    return place
+
+
+def local_of(site: Site, places: np.ndarray, other: Sequence[float] | None, both: bool) -> np.ndarray:
+    """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
+
+    Raises:
+        DataError: both are needed, and nobody says where the other end stands.
+    """
+    local = places - site.origin
+    if not both:
+        return local
+    if site.static_position is None and other is None:
+        raise DataError(OTHER_END)
+    still = np.asarray(other) - site.origin if site.static_position is None else site.static_position
+    pair = np.broadcast_to(still, local.shape), local
+    return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
+
+
+def _usual(
+    promise: Promise | None, numbers: np.ndarray, noise_db: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and deviation (T, 2) of each station's measured levels, and its floor (T,) [dB].
+
+    The floor is the level below which it is not heard, else the weakest but for 1 % that was measured of it.
+    """
+    least = -np.inf if noise_db is None else noise_db
+    usual, floor = np.full((len(numbers), 2), np.nan), np.full(len(numbers), least)
+    if promise is None:
+        return usual, floor
+    for row, number in enumerate(numbers):
+        own = promise.evidence.at(np.flatnonzero(promise.evidence.station == number))
+        if len(own):
+            usual[row] = own.level_db.mean(), own.level_db.std()
+            quiet = own.level_db[own.side > 0]
+            floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
+    return usual, floor
+
+
+def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:
+    """Delay spread [ns] and azimuth [deg] of the strongest path (ny, nx), of models with paths."""
+    if not isinstance(predictor.method, HasPaths) or predictor.site.stations is not None:
+        return {}
+    layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
+    for cells in _chunks(np.flatnonzero(best >= 0), CHUNK):
+        try:
+            paths = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
+        except ValueError:  # what was fitted has none
+            return {}
+        power = np.abs(paths.gain).astype(np.float64) ** 2
+        power, delay = power.mean(axis=1), np.asarray(paths.delay_s, np.float64).mean(axis=1)
+        share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+        middle = (share * delay).sum(axis=1, keepdims=True)
+        spread = np.sqrt((share * (delay - middle) ** 2).sum(axis=1))
+        layers["delay_spread_ns"].reshape(-1)[cells] = spread * 1e9
+        if paths.direction is not None:
+            towards = paths.direction[np.arange(len(cells)), power.argmax(axis=1)]
+            azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
+            layers["direction_deg"].reshape(-1)[cells] = azimuth
+    return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}
+
+
+def bands_of(site: Site, numbers: np.ndarray) -> tuple[str, ...]:
+    """Carriers of stations (T,); () where all have one."""
+    carrier = None if site.stations is None else site.stations.carrier_hz
+    if carrier is None or len(np.unique(carrier[numbers])) == 1:
+        return ()
+    return tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier[numbers])
+
+
+def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
+    """Directions (T,) that sectors face [deg from north], NaN of what is none."""
+    sector = None if site.stations is None else site.stations.sector
+    return np.full(len(numbers), np.nan) if sector is None else sector[numbers, 0]
+
+
+def _still(site: Site, names: Sequence[str]) -> np.ndarray:
+    """World places (T, 2) of the stations [m], NaN where unknown."""
+    if site.stations is not None:
+        rows = [site.stations.name.index(name) for name in names]
+        return site.stations.position[rows][:, :2] + site.origin[:2]
+    place = np.full(3, np.nan) if site.static_position is None else site.static_position
+    return (place + site.origin)[None, :2]

@@ -1,0 +1,317 @@
+"""A PNG of every layer of a map: floor plan beneath, measured points, stations, scale bar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap
+from matplotlib.transforms import Affine2D
+from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import label as areas_of
+
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.placing import Placing
+from gsparc.apps.maps.planning import Plan
+from gsparc.apps.maps.promise import Promise
+from gsparc.data.links.georeference import Georeference
+from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.from_above import (
+    OUTLINE,
+    annotate,
+    bounded,
+    draw_measured,
+    draw_sectors,
+    draw_stations,
+    in_degrees,
+    legend_below,
+    scale_bar,
+)
+from gsparc.prediction.predictor import Predictor
+
+MOST_OVERLAP = 5.0  # stations that the colours end with
+GREY = (170, 170, 170)  # of values that are not known
+INCHES = 7.0  # longer side of the map
+NAMED = 15  # stations; of more only their marks are drawn
+MOST_COLOURS = 10
+BESIDE = 2  # cells between areas that must not have one colour
+DEEP = 0.025  # of the map's longer side, from the edge of an area that its name is written on
+UNSURE = "hatched: more likely another station, or none that is heard"
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What colours mean: from `low` to `high` of `label`, in a matplotlib colour map."""
+
+    label: str
+    low: float
+    high: float
+    colours: str = "viridis"
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
+        with np.errstate(invalid="ignore"):
+            share = np.clip((values - self.low) / max(self.high - self.low, 1e-30), 0, 1)
+        known = np.isfinite(values)
+        rgb = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
+        rgb[~known] = GREY
+        return rgb
+
+    @classmethod
+    def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
+        """From the 1 to the 99 % quantile of those values that are finite."""
+        known = values[np.isfinite(values)]
+        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+        return cls(label, float(low), float(high if high > low else low + 1.0), colours)
+
+    def strip(self) -> np.ndarray:
+        """Colours (16, 3) uint8 from low to high."""
+        return self.of(np.linspace(self.low, self.high, 16))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer as it is drawn.
+
+    Attributes:
+        name: of its file and its button.
+        values: (ny, nx) float, NaN where nothing is said.
+        legend: what its colours mean, with the unit.
+        words: names of whole numbers, for a layer of classes; "" of those that are nowhere on the map.
+        unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
+    """
+
+    name: str
+    values: np.ndarray
+    legend: Legend
+    words: tuple[str, ...] = ()
+    unsure: tuple[np.ndarray, str] | None = None
+
+    def table(self) -> np.ndarray:
+        """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
+        if not self.words:
+            return colormaps[self.legend.colours](np.linspace(0, 1, 256))
+        return np.asarray(colormaps["tab10"](shades(self.values, len(self.words))))
+
+
+def shades(classes: np.ndarray, count: int) -> np.ndarray:
+    """Numbers (count,) below `MOST_COLOURS`, different for classes (ny, nx) that lie beside each other."""
+    if count <= MOST_COLOURS:
+        return np.arange(count)
+    number = np.where(np.isfinite(classes), classes, count).astype(int)
+    beside = np.zeros((count + 1, count + 1), int)
+    for step in range(1, BESIDE + 1):
+        np.add.at(beside, (number[step:], number[:-step]), 1)
+        np.add.at(beside, (number[:, step:], number[:, :-step]), 1)
+    beside += beside.T
+    result = np.full(count, -1)
+    for one in np.argsort(-np.bincount(number.reshape(-1), minlength=count)[:count], kind="stable"):
+        used = result >= 0
+        near = np.bincount(result[used], beside[one, :count][used], MOST_COLOURS)
+        result[one] = np.lexsort((np.bincount(result[used], minlength=MOST_COLOURS), near))[0]
+    return result
+
+
+def named_areas(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
+    """Row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
+    least = max(DEEP * max(classes.shape), 1.5)
+    for number in np.unique(classes[np.isfinite(classes)]).astype(int):
+        parts, count = areas_of(classes == number)
+        for part in range(1, count + 1):
+            deep = distance_transform_edt(np.pad(parts == part, 1))[1:-1, 1:-1]
+            if deep.max() >= least:
+                yield *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)), words[number]
+
+
+def layers(field: FieldMap) -> Iterator[Layer]:
+    """Every layer of a map that says something; of several stations, also the power of each."""
+    several, unit = len(field.stations) > 1, field.unit
+    of = " of the strongest station" if several else ""
+    layer = field.layer("power_db")
+    yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
+    if several:
+        doubt = (field.unsure, UNSURE) if field.unsure.any() else None
+        yield _servers("best_server", field.layer("best_server"), field.stations, doubt)
+    for band in dict.fromkeys(field.bands):
+        own = field.power_db[np.array(field.bands) == band]
+        names = tuple(name for name, its in zip(field.stations, field.bands, strict=True) if its == band)
+        if not np.isfinite(own).any():
+            continue
+        strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.shape)
+        level = np.take_along_axis(own, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
+        yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
+        where = np.where(strongest == REFUSED, np.nan, strongest)
+        yield _servers(f"best_server {band}", where, names, None)
+    if np.isfinite(field.sinr_db).any():
+        label = "signal over interference and noise [dB]"
+        yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
+    label = f"probability of less than {field.threshold_db:g} {unit}"
+    yield Layer("outage", field.outage, Legend(label, 0.0, 1.0, "magma_r"))
+    error, width = field.layer("expected_error_db"), field.strongest(field.upper_db - field.lower_db)
+    yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
+    label = f"width of the {field.share:.0%} interval [dB]"
+    yield Layer("width", width, Legend.over(label, width, "cividis"))
+    if "overlap" in field.extra:
+        label = f"stations within {OVERLAP_DB:g} dB of the strongest, on its carrier"
+        yield Layer("overlap", field.extra["overlap"], Legend(label, 1.0, MOST_OVERLAP, "YlOrRd"))
+    if "delay_spread_ns" in field.extra:
+        layer = field.extra["delay_spread_ns"]
+        yield Layer("delay_spread_ns", layer, Legend.over("delay spread [ns]", layer, "plasma"))
+    if "direction_deg" in field.extra:
+        legend = Legend("azimuth of the strongest path [degrees]", -180.0, 180.0, "twilight")
+        yield Layer("direction_deg", field.extra["direction_deg"], legend)
+    for name, layer in zip(field.stations, field.power_db, strict=True) if several else ():
+        if np.isfinite(layer).any():
+            yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
+
+
+def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], doubt: Any) -> Layer:
+    there = np.unique(number[np.isfinite(number)]).astype(int)
+    words = tuple(one if k in there else "" for k, one in enumerate(stations))
+    return Layer(name, number, Legend("strongest station", -0.5, len(words) - 0.5), words, doubt)
+
+
+def file_name(layer: Layer) -> str:
+    """Of its PNG, without what a file system may not like."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
+
+
+def draw_layer(
+    field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None,
+    degrees: Georeference | None = None,
+) -> None:  # fmt: skip
+    """Save one layer as PNG, over a floor plan; with axes in degrees where `degrees` says how."""
+    left, right, low, high = field.grid.extent
+    width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
+    figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
+    axis = axes[0, 0]
+    nothing = np.where(field.refused, 1.0, np.nan)
+    grey = ListedColormap(["0.82"])
+    axis.imshow(nothing, origin="lower", extent=field.grid.extent, cmap=grey, zorder=1, alpha=0.6)
+    legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
+    limits = {"vmin": legend.low, "vmax": legend.high}
+    image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    if layer.words:
+        _name_areas(axis, field.grid, layer)
+    else:
+        beyond = bool((known < legend.low).any()), bool((known > legend.high).any())
+        ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+        figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
+    if layer.unsure is not None:
+        _hatch(axis, field, *layer.unsure)
+    bounded(axis, (left, low), (right, high), title=title)
+    draw_places(axis, field)
+    scale_bar(axis)
+    if degrees is not None:
+        in_degrees(axis, degrees)
+    if field.refused.any():
+        axis.plot([], [], "s", color="0.82", label="too far from what was measured")
+    legend_below(figure)
+    save(figure, path, 110)
+
+
+def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
+    """Names on their areas; of few stations also in the legend."""
+    for row, column, word in named_areas(layer.values, layer.words):
+        axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
+                  path_effects=OUTLINE)  # fmt: skip
+    shown = [(colour, word) for colour, word in zip(layer.table(), layer.words, strict=True) if word]
+    for colour, word in shown if len(shown) <= MOST_COLOURS else ():
+        axis.plot([], [], "s", color=colour, label=word)
+
+
+def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
+    """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
+    if min(cells.shape) > 1:
+        how: dict[str, Any] = {"hatches": ["", "////"], "levels": [-0.5, 0.5, 1.5], "colors": "none"}
+        hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
+        hatches.set(edgecolor="black", linewidth=0.0)
+        axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
+
+
+def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any) -> Any:
+    """Values (ny, nx) of cells, through which a plan beneath them is seen."""
+    if plan is not None:
+        draw_plan(axis, plan)
+    how = {"origin": "lower", "extent": grid.extent, "interpolation": "nearest", "zorder": 2}
+    return axis.imshow(values, alpha=1.0 if plan is None else 0.65, **how, **colours)
+
+
+def draw_plan(axis: Any, plan: FloorPlan) -> None:
+    """The floor plan, where it lies."""
+    height, width = plan.image.shape[:2]
+    a, b, c, d, e, f = plan.matrix()
+    turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
+    axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
+
+
+def draw_places(axis: Any, field: FieldMap) -> None:
+    """Measured points and stations; those outside the map are left out."""
+    left, right, low, high = field.grid.extent
+    draw_measured(axis, field.places)
+    known = field.station_place
+    inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
+    faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(known), bool)
+    if (inside & ~faces).any():
+        draw_stations(axis, known[inside & ~faces])
+    if (inside & faces).any():
+        draw_sectors(axis, known[inside & faces], field.azimuth[inside & faces])
+    if 1 < len(known) <= NAMED and not faces.any():
+        for where, name in zip(known[inside], np.array(field.stations)[inside], strict=True):
+            annotate(axis, name, where)
+
+
+def draw_plan_picture(
+    batch: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
+) -> None:
+    """Expected error before and after, the chosen places, and how it falls."""
+    left, right, low, high = batch.grid.extent
+    wide = (right - left) / max(right - left, high - low)
+    tall = (high - low) / max(right - left, high - low)
+    figure, ((before, after, curve),) = panels(
+        11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
+    )
+    errors = np.concatenate([batch.error_before, batch.error_after])
+    limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
+    for axis, values, title in ((before, batch.error_before, "before"), (after, batch.error_after, "after")):
+        image = np.full(batch.grid.shape, np.nan)
+        image[batch.grid.inside] = values
+        mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
+        bounded(axis, (left, low), (right, high), ylabel="", title=title)
+        scale_bar(axis)
+    if promise is not None and predictor is not None:
+        places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
+        draw_measured(before, places)
+    how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
+    after.plot(*batch.places[:, :2].T, linestyle="-" if batch.walk else "", linewidth=1, zorder=3, **how)
+    for number, place in enumerate(batch.places[:60], 1):
+        after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
+                       path_effects=OUTLINE, zorder=4)  # fmt: skip
+    figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
+    curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
+    curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
+    curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
+    curve.grid(alpha=0.3)
+    save(figure, path, 100)
+
+
+def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
+    """The goal at every candidate, the stations that stand, and the best place."""
+    left, right, low, high = placing.grid.extent
+    figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
+    label = f"share of the area with {threshold_db:g} {unit} or more"
+    label = label if placing.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
+    dots = axis.scatter(*placing.places[:, :2].T, c=placing.goal, s=60, marker="s", cmap="viridis")
+    figure.colorbar(dots, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    draw_stations(axis, placing.stations)
+    draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
+    bounded(axis, (left, low), (right, high))
+    scale_bar(axis)
+    legend_below(figure)
+    save(figure, path, 100)

@@ -1,0 +1,218 @@
+"""Where one more station serves an area best, as the model predicts stations that were never there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy.stats import norm
+
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.making import levels_at, map_of
+from gsparc.apps.maps.planning import coarse_grid, walkable_places
+from gsparc.apps.maps.promise import Promise, evidence_of, without
+from gsparc.data.blocks import evenly
+from gsparc.data.errors import DataError
+from gsparc.data.executor import each
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.method import Method
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
+
+Goal = Literal["coverage", "worst"]
+GOALS = get_args(Goal)
+DECILE = 0.1
+SURE = 1.645  # deviations of a 90 % interval
+LEAST_STATIONS = 3  # for leaving one out
+
+
+@dataclass(frozen=True)
+class NewStation:
+    """How wrong the model is about a station that it never heard.
+
+    Attributes:
+        offset_db: deviation of the mean error of a whole station [dB].
+        within: deviation of errors about that mean, in deviations that the model states.
+        stations: left out, one at a time; 0: nobody was, and the model's own deviations are taken.
+    """
+
+    offset_db: float = 0.0
+    within: float = 1.0
+    stations: int = 0
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Candidates for one more station, the best first.
+
+    Attributes:
+        places: (n, 3) world [m].
+        goal: (n,) with a station there; `coverage`: share of the area, `worst`: power that nine tenths of it
+            exceed [dB].
+        low, high: (n,) the ends of its 90 % interval.
+        before: the goal as it is.
+        what: `coverage` or `worst`.
+        grid: the area.
+        stations: (T, 2) that stand already [m].
+        error: of stations left out.
+    """
+
+    places: np.ndarray
+    goal: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    before: float
+    what: Goal
+    grid: Grid
+    stations: np.ndarray
+    error: NewStation
+
+
+def place_next(
+    predictor: Predictor,
+    area: Any = None,
+    *,
+    goal: Goal = "coverage",
+    threshold_db: float = -100.0,
+    height_m: float | None = None,
+    sites: Any = None,
+    station_height_m: float | None = None,
+    count: int = 100,
+    promise: Promise | None = None,
+    error: NewStation | None = None,
+    dry: bool = False,
+) -> Placing:
+    """Try one more station at every candidate.
+
+    Args:
+        predictor: of powers at several stations, learned together.
+        area, height_m, threshold_db: see `map_of`.
+        goal: `coverage`, the expected share of the area with `threshold_db` or more, or `worst`.
+        sites: GeoJSON of where a station may stand: polygons or lines; None: the whole area.
+        station_height_m: world; None: the middle height of the stations that stand.
+        count: candidates, about.
+        promise: see `map_of`, of the stations that stand.
+        error: see `new_station_error`; None: the model's own deviations.
+        dry: predict one cell of each station that stands alone: whether everything asked for is possible.
+
+    Raises:
+        DataError: the model cannot predict a station that was never there, or anything else that is wrong.
+    """
+    site = predictor.site
+    if goal not in GOALS:
+        raise DataError(f"goal={goal}: one of {', '.join(GOALS)} is needed")
+    if type(count) is not int or count < 1:
+        raise DataError(f"count={count}: a whole number of at least 1 is needed")
+    if site.stations is None or site.static_end is None:
+        raise DataError(f"place: the model of {site.name} knows no stations among which to put another")
+    grid = coarse_grid(predictor, area, height_m)
+    still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
+    height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
+    candidates = _candidates(grid, sites, predictor, height, count)
+    cells = grid.places()
+    try:
+        _new(predictor, candidates[0], cells[:1])
+    except ValueError as refused:
+        raise unheard_refused(f"{predictor.method.name} ({refused})") from None
+    left, right, south, north = grid.extent
+    now = map_of(
+        predictor,
+        [left, south, right, north],
+        height_m=grid.height,
+        step_m=grid.step,
+        threshold_db=threshold_db,
+        promise=promise,
+        dry=dry,
+    )
+    flat = grid.inside.reshape(-1)
+    old_power = np.nan_to_num(now.strongest(now.power_db).reshape(-1)[flat], nan=-np.inf)
+    old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)
+    error = error or NewStation()
+
+    def tried(place: np.ndarray) -> np.ndarray:
+        level, spread = _new(predictor, place, cells)
+        goals = np.empty(3)
+        for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
+            if goal == "worst":
+                goals[k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
+                continue
+            wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
+            outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
+            goals[k] = np.mean(1 - np.minimum(old_outage, outage))
+        return goals
+
+    scores = np.empty((len(candidates), 3))
+    for row, goals in each(tried, list(candidates), "candidates"):
+        scores[row] = goals
+    before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
+    order = np.argsort(-scores[:, 0], kind="stable")
+    value, low, high = scores[order].T
+    return Placing(candidates[order], value, low, high, before, goal, grid, still[:, :2], error)
+
+
+def new_station_error(
+    method: Method,
+    make: Callable[[], Method],
+    data: Measurements,
+    fold: Fold,
+    context: FitContext,
+    most: int = 4,
+) -> NewStation:
+    """Leave out whole stations, up to `most`, and predict them from the others."""
+    assert data.site.stations is not None and data.station is not None
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    heard = np.unique(data.station[known])
+    if len(heard) < LEAST_STATIONS:
+        return NewStation()
+    chosen = np.random.default_rng(context.seed).permutation(heard)[:most]
+    parts: list[Evidence] = []
+    for one in chosen:
+        own = data.station[known] == one
+        inner = Fold(known[~own], known[:0], known[own])
+        learned = without(method, make, data, inner, context)
+        parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
+    errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
+    means = np.array([error.mean() for error in errors if len(error)])
+    pairs = zip(errors, means, parts, strict=False)
+    inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
+    within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
+    return NewStation(float(np.sqrt(np.mean(means**2))), within, len(means))
+
+
+def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> np.ndarray:
+    if sites is not None:
+        every = walkable_places(sites, grid, predictor.site.georeference, "sites")
+    else:
+        every = grid.places()
+    few = every[evenly(len(every), count)]
+    return np.column_stack([few[:, :2], np.full(len(few), height)])
+
+
+def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level and deviation (n,) [dB] of a station at `place` (3,) in cells (n, 3)."""
+    level, spread = levels_at(predictor, cells, station=place)
+    return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
+
+
+def unheard_refused(what: str) -> DataError:
+    """For models that know no station but those they learned from."""
+    return DataError(
+        f"{what}: answers only for the stations that it heard; train with stations=together, for example "
+        "model=gp or distance_law"
+    )
+
+
+def number(what: Goal, value: float, unit: str = "dB") -> str:
+    """A goal's value with its unit."""
+    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
+
+
+def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
+    """A goal's value in words."""
+    if what == "coverage":
+        return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
+    return f"nine tenths of the area have {number(what, value, unit)} or more"

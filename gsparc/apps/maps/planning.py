@@ -1,0 +1,335 @@
+"""Where to measure next: the places that together take most off the expected error over an area.
+
+Greedy choice of the largest drop of the mean posterior variance (A-optimal design; A. Krause, A. Singh and
+C. Guestrin, J. Mach. Learn. Res. 9 (2008), choose greedily by information instead).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.covariance import ErrorCovariance, before_measuring, unknown_of
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.geojson import read_shapes
+from gsparc.apps.maps.making import answering
+from gsparc.apps.maps.promise import Promise
+from gsparc.data.errors import DataError
+from gsparc.data.limits import finite
+from gsparc.data.links.georeference import Georeference
+from gsparc.prediction.predictor import Predictor
+
+TARGETS = 900  # places that the error is averaged over, about
+CANDIDATES = 900  # where somebody may measure, at most
+WORTH = 0.02  # share of the expected error over an area, that places must take away to be worth their walk
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Places to measure, the most telling first, or in the order of a walk.
+
+    Attributes:
+        places: (n, 3) world [m].
+        expected_db: (n,) expected error over the area once this place and those chosen before it are
+            measured [dB].
+        before_db: the same before any of them is.
+        chosen: (n,) int64, which the greedy choice took first, 0 to n - 1.
+        length_m: of the walk in this order [m].
+        grid: the area.
+        error_before, error_after: (S,) expected error at `at` [dB].
+        at: (S, 3) places that errors were averaged over [m].
+        scatter_db: of these errors, that of a single measurement, which no other place takes away [dB].
+        walk: whether the order is one.
+        stopped: why there are fewer than were asked for; "" where there are not.
+    """
+
+    places: np.ndarray
+    expected_db: np.ndarray
+    before_db: float
+    chosen: np.ndarray
+    length_m: float
+    grid: Grid
+    error_before: np.ndarray
+    error_after: np.ndarray
+    at: np.ndarray
+    scatter_db: float
+    walk: bool = False
+    stopped: str = ""
+
+    @property
+    def after_db(self) -> float:
+        """Expected error once all are measured [dB]."""
+        return float(self.expected_db[self.chosen.argmax()]) if len(self.places) else self.before_db
+
+    @property
+    def in_vain(self) -> str:
+        """Why these places are hardly worth measuring; "" where they are."""
+        gain = self.before_db - self.after_db
+        if not len(self.places) or gain >= WORTH * self.before_db:
+            return ""
+        return (
+            f"hardly worth it: {len(self.places)} places (a walk of {self.length_m:.4g} m) take {gain:.2g} "
+            f"dB off {self.before_db:.2f} dB, {self.scatter_db:.2f} dB of which are the scatter of single "
+            "measurements; area=... where less was measured needs them more"
+        )
+
+
+def plan_next(
+    predictor: Predictor | None,
+    count: int = 20,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    walkable: Any = None,
+    plan: FloorPlan | None = None,
+    stations: Sequence[str | int] | None = None,
+    other_end: Sequence[float] | None = None,
+    promise: Promise | None = None,
+    least_gain_db: float = 0.0,
+    route: bool = False,
+    start: Sequence[float] | None = None,
+    route_m: float | None = None,
+    length_m: float | None = None,
+) -> Plan:
+    """Choose places to measure next, as a batch.
+
+    >>> plan = gsparc.apps.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
+    >>> plan.places.shape, plan.after_db < plan.before_db
+    ((20, 3), True)
+
+    Args:
+        predictor: of powers; None before anything is measured, with `area` or `plan`.
+        count: places wanted.
+        area, height_m, plan: see `grid_of`; with a promise and neither area nor plan, what it answers for.
+        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as corridors; None: the
+            whole area.
+        stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
+        promise: evidence of held-out blocks, which scales the model's own variances.
+        least_gain_db: stop where a place takes less than this off the expected error.
+        route: whether places are put in the order of a short walk.
+        start: (2,) where the walk starts [m]; None: anywhere.
+        route_m: longest walk [m]; None: any.
+        length_m: before anything is measured, over which powers are alike [m].
+
+    Raises:
+        DataError: anything wrong with what is asked for.
+    """
+    if type(count) is not int or count < 1:
+        raise DataError(f"count={count}: a whole number of at least 1 is needed")
+    for name, metres in (("route_m", route_m), ("length_m", length_m)):
+        if metres is not None and not (np.isfinite(metres) and metres > 0):
+            raise DataError(f"{name}={metres}: metres above 0 are needed")
+    if not (np.isfinite(least_gain_db) and least_gain_db >= 0):
+        raise DataError(f"least_gain_db={least_gain_db}: at least 0 dB is needed")
+    origin = None if predictor is None else predictor.site.georeference
+    grid = coarse_grid(predictor, area, height_m, plan, promise)
+    targets = grid.places()
+    allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
+    places, free, wanted = _joined(targets, allowed)
+    if predictor is None:
+        unknown = before_measuring(places, length_m)
+    else:
+        names, _ = answering(predictor, stations)
+        unknown = unknown_of(predictor, places, names, promise, other_end)
+    begin = None if start is None else _start(start)
+    tour = Tour(begin, route_m)
+    first = _expected(unknown, wanted)
+    before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
+    after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    walk = route or route_m is not None
+    order = tour.order() if walk else np.arange(len(chosen))
+    picked = places[chosen] if len(chosen) else np.zeros((0, 3))
+    scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
+    return Plan(
+        picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
+        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted],
+        scatter, walk, stopped,
+    )  # fmt: skip
+
+
+def coarse_grid(
+    predictor: Predictor | None,
+    area: Any,
+    height_m: float | None,
+    plan: FloorPlan | None = None,
+    promise: Promise | None = None,
+) -> Grid:
+    """About `TARGETS` cells; where nobody says which, those that a promise reaches."""
+    fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
+    if area is None and plan is None and promise is not None and predictor is not None:
+        local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
+        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.shape)
+        fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
+    left, right, low, high = fine.extent
+    share = fine.inside.mean()
+    step = float(np.sqrt((right - left) * (high - low) * share / TARGETS))
+    x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
+    column, row = (((v - a) / fine.step).astype(int).clip(0, n - 1)
+                   for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y))))  # fmt: skip
+    inside = fine.inside[np.ix_(row, column)]
+    if not inside.any():
+        return fine
+    return replace(fine, x=x, y=y, step=step, inside=inside)
+
+
+def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
+    """Places (n, 3) in polygons or along lines of a file."""
+    left, right, south, north = grid.extent
+    area, lines = read_shapes(path, key, origin, True, max(right - left, north - south))
+    from shapely import contains_xy, get_coordinates
+
+    points = [np.zeros((0, 2))]
+    if not area.is_empty:
+        low, high = np.reshape(area.bounds, (2, 2))
+        step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
+        x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
+        every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        points.append(every[contains_xy(area, every)])
+    for line in lines:
+        at = np.linspace(0, line.length, max(2, int(np.ceil(2 * line.length / grid.step)) + 1))
+        points.append(get_coordinates(line.interpolate(at)))
+    places = np.unique(np.concatenate(points), axis=0)
+    if not len(places):
+        raise DataError(f"{key}={path}: its polygons are too small for any place")
+    if len(places) > CANDIDATES:
+        places = places[np.random.default_rng(0).permutation(len(places))[:CANDIDATES]]
+    return np.column_stack([places, np.full(len(places), grid.height)])
+
+
+def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (S, 3), which are candidates and which are targets (S,) bool."""
+    if targets is allowed:
+        every = np.ones(len(targets), bool)
+        return targets, every, every.copy()
+    places = np.concatenate([targets, allowed])
+    wanted = np.arange(len(places)) < len(targets)
+    return places, ~wanted, wanted
+
+
+def greedy(
+    unknown: list[ErrorCovariance],
+    free: np.ndarray,
+    wanted: np.ndarray,
+    places: np.ndarray,
+    count: int,
+    least_gain_db: float,
+    tour: Tour,
+) -> tuple[list[int], list[float], str]:
+    """Chosen places, expected error after each, and why it stopped early."""
+    free = free.copy()
+    chosen: list[int] = []
+    expected: list[float] = []
+    error = _expected(unknown, wanted)
+    while len(chosen) < count:
+        gains = np.sum([one.gains(wanted) for one in unknown], axis=0)
+        possible = free & tour.within(places)
+        if not possible.any():
+            why = "no place is left" if not free.any() else "no other place fits in the walk"
+            return chosen, expected, f"{why} after {len(chosen)} places"
+        best = int(np.where(possible, gains, -np.inf).argmax())
+        left = error**2 - gains[best] / (len(unknown) * wanted.sum())
+        gain = error - float(np.sqrt(max(left, 0)))
+        if gain < least_gain_db:
+            return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
+        for one in unknown:
+            one.measured(best)
+        error = _expected(unknown, wanted)
+        chosen.append(best)
+        expected.append(error)
+        tour.add(places[best])
+        free[best] = False
+    return chosen, expected, ""
+
+
+def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
+    return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
+
+
+def _start(value: Sequence[float]) -> np.ndarray:
+    place = finite(value)
+    if place.shape not in ((2,), (3,)):
+        raise DataError(f"start={value}: [x,y] in metres is needed")
+    return place[:2]
+
+
+ROUNDS = 50
+
+
+class Tour:
+    """An open walk that grows place by place.
+
+    Args:
+        start: (2,) where it starts [m]; None: at whichever place.
+        longest: metres it may have; None: any.
+    """
+
+    def __init__(self, start: np.ndarray | None, longest: float | None) -> None:
+        self.start, self.longest = start, longest
+        self._places: list[np.ndarray] = []  # as they were added
+        self._walk: list[int] = []  # their numbers in the order of the walk
+
+    def within(self, places: np.ndarray) -> np.ndarray:
+        """Which of places (n, 3) can be added, (n,) bool."""
+        if self.longest is None:
+            return np.ones(len(places), bool)
+        length = self.length_of(self._stops(), self.start)
+        return self._insertions(places[:, :2]).min(axis=0) + length <= self.longest
+
+    def add(self, place: np.ndarray) -> None:
+        """Put a place (3,) where it lengthens the walk least."""
+        at = int(self._insertions(place[None, :2])[:, 0].argmin())
+        self._places.append(place[:2])
+        self._walk.insert(at, len(self._places) - 1)
+        if self.longest is not None:
+            self._walk = self._shorter()
+
+    def order(self) -> np.ndarray:
+        """Numbers (n,) int64 of the places, as they were added, in the order of the walk."""
+        return np.array(self._shorter(), np.int64)
+
+    @staticmethod
+    def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
+        """Of a walk through places (n, 2 or 3) in their order [m]."""
+        stops = places[:, :2] if start is None else np.vstack([start, places[:, :2]])
+        return float(np.hypot(*np.diff(stops, axis=0).T).sum()) if len(stops) > 1 else 0.0
+
+    def _stops(self) -> np.ndarray:
+        return np.array([self._places[k] for k in self._walk]).reshape(-1, 2)
+
+    def _ends(self, stops: np.ndarray) -> np.ndarray:
+        """Stops (n + 2, 2) with what is before and after them; NaN where there is nothing."""
+        nothing = np.full(2, np.nan)
+        return np.vstack([nothing if self.start is None else self.start, stops, nothing])
+
+    def _insertions(self, places: np.ndarray) -> np.ndarray:
+        """What each of places (n, 2) adds to the walk before each stop, or at its end: (stops + 1, n) [m]."""
+        stops = self._ends(self._stops())
+        to = _apart(stops[:, None], places)
+        return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
+
+    def _shorter(self) -> list[int]:
+        """The walk after turning stretches round (G. A. Croes, Oper. Res. 6 (1958)) while that helps."""
+        stops = self._ends(np.array(self._places).reshape(-1, 2))
+        apart = _apart(stops[:, None], stops)
+        walk = [0, *(k + 1 for k in self._walk), len(stops) - 1]  # rows of `stops`
+        for _ in range(ROUNDS):
+            before = list(walk)
+            for i in range(1, len(walk) - 2):
+                for j in range(i + 1, len(walk) - 1):
+                    a, b, c, d = walk[i - 1], walk[i], walk[j], walk[j + 1]
+                    if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-9:
+                        walk[i : j + 1] = walk[i : j + 1][::-1]
+            if walk == before:
+                break
+        return [k - 1 for k in walk[1:-1]]
+
+
+def _apart(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Distances of places (..., 2) [m]; 0 to nothing, which is NaN."""
+    return np.nan_to_num(np.hypot(*np.moveaxis(one - two, -1, 0)))

@@ -1,0 +1,187 @@
+"""Evidence for a promise: the model's method fitted anew without whole blocks, and asked about them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
+from gsparc.apps.maps.levels import measured, predicted
+from gsparc.data.errors import DataError
+from gsparc.data.executor import each
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings
+from gsparc.models import checkpoint
+from gsparc.models.method import Method, Reconditions, predictions
+from gsparc.models.per_station import PerStation, for_links, trained_stations
+from gsparc.training.context import FitContext
+
+KEY = "map"
+CHUNK = 512  # rows predicted at a time
+SIDES = (1.0, 2.0)  # of blocks, by turns: near and far rows alike
+
+
+@dataclass(frozen=True)
+class PromiseSettings(Checked):
+    """How evidence is gathered.
+
+    Attributes:
+        share: of measurements that intervals hold.
+        folds: fits, each without other blocks.
+        rows: of each fold that are asked about, at most, drawn evenly.
+        block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer side.
+        budget_s: seconds of each refit; None: as the model was trained.
+        seed: of the blocks.
+    """
+
+    share: float = setting(0.9, SHARE)
+    folds: int = setting(4, whole(1))
+    rows: int = setting(4000, whole(1))
+    block_m: float | None = setting(None, or_null(POSITIVE))
+    budget_s: float | None = setting(None, or_null(POSITIVE))
+    seed: int = setting(0, whole(0))
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Evidence, and where was measured; stored with a model.
+
+    Attributes:
+        evidence: of held-out rows.
+        known: (n, 3) or (n, 6) local places that the model learned from [m].
+        station: (n,) int64, which each is of.
+        block_m: side of the smaller blocks [m].
+    """
+
+    evidence: Evidence
+    known: np.ndarray
+    station: np.ndarray
+    block_m: float
+
+    def calibration(self, share: float = 0.9) -> Calibration:
+        """See `calibrate`."""
+        return calibrate(self.evidence, share)
+
+    def coverage(self, share: float = 0.9) -> Coverage:
+        """See `gsparc.apps.maps.intervals.cross_validated`."""
+        return cross_validated(self.evidence, share)
+
+    def distance(self, places: np.ndarray, station: int) -> np.ndarray:
+        """From local places (n, D) to the nearest that was learned from (n,) [m]."""
+        return distances(self.known, self.station, places, np.full(len(places), station))
+
+    def keep(self, path: str | Path) -> None:
+        """Store in a checkpoint; the file is rewritten whole or not at all."""
+        own = {"known": self.known, "station": self.station, "block_m": self.block_m}
+        checkpoint.amend(path, {KEY: {**own, "evidence": self.evidence.state()}})
+
+
+def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
+    """What a checkpoint's `extra` holds; None where its map was never calibrated."""
+    state = extra.get(KEY)
+    if state is None:
+        return None
+    known, station = np.asarray(state["known"]), np.asarray(state["station"])
+    return Promise(Evidence.restored(state["evidence"]), known, station, float(state["block_m"]))
+
+
+def gather(
+    method: Method,
+    make: Callable[[], Method],
+    data: Measurements,
+    fold: Fold,
+    settings: PromiseSettings,
+    context: FitContext,
+) -> Promise:
+    """Learn `settings.folds` times without blocks of the training rows, and ask about these.
+
+    A method that can forget rows does so, with its settings as they are; another one is fitted anew.
+
+    Args:
+        method: fitted on the fold.
+        make: an unfitted copy of it.
+        data, fold: that the model learned from.
+        settings: see there.
+        context: of the refits.
+
+    Raises:
+        DataError: too few places for any block.
+        ValueError: the method serves no part of the data.
+    """
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    places = data.moving[known]
+    if settings.budget_s is not None:
+        context = replace(context, budget_s=settings.budget_s)
+    longest = float(np.ptp(places[:, -3:-1], axis=0).max())
+    side = settings.block_m or longest / 10
+    if not side > 0:
+        raise DataError("a promise about a map needs rows at more than one place; measure more")
+
+    def evidence_without(number: int) -> Evidence:
+        split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
+        cut = cut_inside(data, fold, split, 1, settings.seed + number // len(SIDES))
+        inner = answerable(method, data, cut.folds[0])
+        learned = without(method, make, data, inner, replace(context, split=split))
+        rng = np.random.default_rng([settings.seed, number])
+        tried = np.sort(rng.permutation(inner.test)[: settings.rows])
+        unit = cut.unit[tried] + number * (len(data) + 1)
+        return evidence_of(learned, data, replace(inner, test=tried), unit)
+
+    by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    parts = [by_number[number] for number in range(settings.folds)]
+    evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
+    return Promise(evidence, places, station_of(data, known), side)
+
+
+def without(
+    method: Method, make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext
+) -> Method:
+    """A method that knows nothing of the test rows of a fold."""
+    if isinstance(method, Reconditions):
+        refit = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
+        if refit is not None:
+            return refit
+    refit = for_links(make, data)
+    with tempfile.TemporaryDirectory() as folder:
+        refit.fit(data, fold, replace(context, run_dir=Path(folder)))
+    return refit
+
+
+def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:
+    """The fold without test rows of stations that too few training rows are left of."""
+    if not isinstance(method, PerStation):
+        return fold
+    known, _ = trained_stations(method.wrapped, data, fold)
+    assert data.station is not None
+    return replace(fold, test=fold.test[known[data.station[fold.test]]])
+
+
+def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
+    """Of the test rows of a fold, which `method` was fitted to; `block` (n,) says which belong together."""
+    rows, known = fold.test, np.concatenate([fold.train, fold.val])
+    mean, spread = predict_rows(method, data, rows)
+    level, side = measured(data, rows)
+    station = station_of(data, rows)
+    far = distances(data.moving[known], station_of(data, known), data.moving[rows], station)
+    evidence = Evidence(level, mean, spread, far, block, station, side)
+    return evidence.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
+
+
+def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
+    mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    for chosen, _, said in predictions(method, data, rows, CHUNK):
+        mean[chosen], spread[chosen] = predicted(said, data.site.kind, data.site.target_scale)
+    return mean, spread
+
+
+def station_of(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Numbers (n,) int64; 0 where there is one."""
+    return np.zeros(len(rows), np.int64) if data.station is None else data.station[rows].astype(np.int64)

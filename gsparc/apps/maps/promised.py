@@ -1,0 +1,96 @@
+"""The promise of a map: stored with its model or gathered anew, and what its reader must know."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.intervals import Coverage
+from gsparc.apps.maps.promise import Promise, PromiseSettings, gather, stored_promise
+from gsparc.data.errors import DataError
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.evaluation.open_runs import open_files
+from gsparc.models import checkpoint
+from gsparc.models.method import Method
+from gsparc.training.context import FitContext
+
+log = logging.getLogger(__name__)
+
+
+def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
+    """The evidence stored with a model, or gathered from its training data and then stored.
+
+    Args:
+        path: the model's file.
+        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of conf/map.yaml.
+
+    Raises:
+        DataError: the training data are gone, or are others.
+    """
+    how = PromiseSettings(**settings["promise"])
+    if not settings["promised"]:
+        return None
+    stored = checkpoint.read(path)
+    promise = None if settings.get("renew") else stored_promise(stored.extra)
+    if promise is not None and how.block_m in (None, promise.block_m):
+        return promise
+    method, make, data, fold, context = trained(path, settings["dataset"])
+    log.info("a promise for this map: %d fits without blocks of places", how.folds)
+    promise = gather(method, make, data, fold, how, context)
+    promise.coverage(how.share)  # too little evidence is said before anything is stored
+    promise.keep(path)
+    return promise
+
+
+def trained(
+    path: str, dataset: dict[str, Any]
+) -> tuple[Method, Callable[[], Method], Measurements, Fold, FitContext]:
+    """A model, an unfitted copy, the very data and rows that it was trained on, and how.
+
+    Raises:
+        DataError: they are gone, or are others.
+    """
+    try:
+        run = open_files([path], dataset)
+        make, context = run.retraining()
+    except (ValueError, OSError) as error:
+        raise DataError(
+            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
+        ) from None
+    if run.learned != 0 or run.foreign is not None:
+        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+    return run.methods[0], make, run.data, run.split.folds[0], context
+
+
+def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
+    """What a reader of the map must know."""
+    notes = [*field.notes]
+    figures = field.figures()
+    share = figures["map/server_unsure"]
+    if share and len(field.stations) > 1:
+        notes.append(
+            f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
+            "the strongest and above its floor; noise_db=... says where noise lies"
+        )
+    if coverage is None:
+        own = "intervals are the model's own deviations, and places far from data are not refused"
+        return [*notes, f"no promise: {own}"]
+    apart = (
+        f"{coverage.heard_share:.1%} of those with a level, {coverage.silent_share:.1%} of those below one"
+    )
+    apart = "" if np.isnan(coverage.silent_share) else f", {apart}"
+    ours = f"{coverage.share:.1%} did{apart} (mean width {coverage.width_db:.1f} dB"
+    own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
+    notes.append(
+        f"in {field.share:.0%} of the cells a measurement is promised to lie in its interval: of "
+        f"{coverage.rows} rows in {coverage.blocks} held-out blocks {ours}; {own}"
+    )
+    if figures["map/refused"]:
+        cells = f"{figures['map/refused']} of {int(field.grid.inside.sum())} cells"
+        notes.append(f"{cells} are refused: too far from what was measured")
+    return notes

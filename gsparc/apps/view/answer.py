@@ -1,0 +1,136 @@
+"""What a model answers at one pair of places, in numbers that a picture or a sentence needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.apps.maps.levels import predicted
+from gsparc.data.schema import Site
+from gsparc.models.method import HasPaths
+from gsparc.prediction.channels import Paths
+from gsparc.prediction.predictor import Predictor
+
+SILENT_DB = 30.0  # below the strongest, where paths are not shown
+SAME_NS = 0.25  # between delays of one path, as several searches find it
+SAME_COSINE = 0.998  # the same of its directions: 3.6 degrees
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A prediction at one pair of places.
+
+    Attributes:
+        ends: world places (3,) [m] that were given, and that of the static end where it is known.
+        level_db, spread_db: received power and its deviation [dB]; None of spectra.
+        confidence: in [0, 1]; None where the method has none.
+        spectrum: (H, W) in [0, 1]; None of other kinds.
+        response: (A, K) complex channel; None of other kinds.
+        strongest: azimuth and elevation of the strongest direction of a spectrum, at the receiver as a
+            picture of it has them, and in the world [degrees].
+        paths: None where there are none.
+    """
+
+    ends: Mapping[str, np.ndarray]
+    level_db: float | None = None
+    spread_db: float | None = None
+    confidence: float | None = None
+    spectrum: np.ndarray | None = None
+    response: np.ndarray | None = None
+    strongest: tuple[float, float, float, float] | None = None
+    paths: Rays | None = None
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Propagation paths at one place, the strongest first, of those within `SILENT_DB` of it.
+
+    Attributes:
+        gain_db: (N,) mean over antennas.
+        delay_ns: (N,).
+        towards: (N, 3) unit vectors in the world towards where each comes from; None where not known.
+    """
+
+    gain_db: np.ndarray
+    delay_ns: np.ndarray
+    towards: np.ndarray | None
+
+
+def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
+    """Predict at world places (3,) [m] of the ends that move, of one station where there are several.
+
+    Raises:
+        ValueError: a place that cannot be.
+    """
+    site, kind = predictor.site, predictor.site.kind
+    prediction = predictor.linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
+    mean = prediction.mean[0].numpy()
+    still: dict[str, np.ndarray] = {}
+    if site.static_end is not None and site.static_position is not None:
+        still[site.static_end] = site.static_position + site.origin
+    level = spread = None
+    if kind != "spectrum":
+        level, spread = (float(value[0]) for value in predicted(prediction, kind))
+    return Answer(
+        {**still, **ends}, level, spread,
+        None if prediction.confidence is None else float(prediction.confidence[0]),
+        mean if kind == "spectrum" else None, mean if kind == "csi" else None,
+        _strongest(mean, site) if kind == "spectrum" else None, _rays(predictor, ends),
+    )  # fmt: skip
+
+
+def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
+    """Of a direction (3,) [degrees]."""
+    x, y, z = towards
+    return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float, float, float]:
+    assert site.grid is not None
+    towards = site.grid.directions().numpy().reshape(-1, 3)[int(spectrum.argmax())]
+    azimuth, elevation = azimuth_elevation(towards)
+    left = site.grid.edges()[0]
+    world = azimuth_elevation(towards if site.rx_rotation is None else site.rx_rotation @ towards)
+    return left + (azimuth - left) % 360, elevation, *world
+
+
+def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
+    if predictor.site.kind != "csi" or not isinstance(predictor.method, HasPaths):
+        return None
+    try:
+        paths: Paths = predictor.paths(**ends)
+    except ValueError:  # what was fitted has none
+        return None
+    delay = np.asarray(paths.delay_s[0], np.float64).mean(axis=0) * 1e9
+    towards = None if paths.direction is None else np.asarray(paths.direction[0], np.float64)
+    return rays(paths.gain[0], delay, towards)
+
+
+def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
+    """Paths as they are shown; those that several searches found alike are one, of their summed gain.
+
+    Args:
+        gain: (A, N) complex, with their phases.
+        delay_ns: (N,).
+        towards: (N, 3); None where not known.
+    """
+    gain = gain.astype(np.complex128)
+    left = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
+    firsts, power = [], []
+    while len(left):
+        first = left[0]
+        alike = left == first
+        if towards is not None:
+            alike |= (np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS) & (
+                towards[left] @ towards[first] > SAME_COSINE
+            )
+        firsts.append(first)
+        power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
+        left = left[~alike]
+    level = np.array(power)
+    order = np.argsort(-level)
+    order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
+    chosen = np.array(firsts, np.int64)[order]
+    return Rays(10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen])

@@ -1,0 +1,272 @@
+"""The scene of a model, and the parts of it that follow a dragged end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.levels import MAPPED
+from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.answer import SILENT_DB, Answer
+from gsparc.apps.view.crossed import fans
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.viewed import Measured, Viewed
+from gsparc.data.blocks import evenly
+from gsparc.data.query import Query
+from gsparc.data.schema import LIGHT, Site
+from gsparc.data.site_objects import GaussianCloud
+from gsparc.data.walls import SceneWalls, box_faces
+from gsparc.models.method import HasGaussians
+from gsparc.ops import Pose
+
+log = logging.getLogger(__name__)
+
+WORDS = ("transmitter", "receiver")  # that stand still
+MOST_NAMES = 5  # stations that are named at once
+MOST_POINTS = 20_000  # measured places that are drawn
+DIRECTIONS = 9000  # of a sphere of power, at most
+QUERIES = 16  # places at which Gaussians are asked what they emit
+RANGE_DB = 30.0  # of emissions that are told apart
+RADIUS = 0.08  # of a sphere of power, of the extent of the site
+SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
+BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
+REACH = 0.8  # of the extent, that rays are drawn to at most
+MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
+SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known walls"}
+PATHS = Legend(
+    "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
+)
+VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
+    "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Building:
+    """What is known of a site besides its model.
+
+    Attributes:
+        plan: of the floor, beneath all.
+        walls: known walls and boxes.
+    """
+
+    plan: FloorPlan | None = None
+    walls: SceneWalls | None = None
+
+
+def build(viewed: Viewed, building: Building, station: str | None, measured: Measured | None) -> Scene:
+    """Everything that stands still, with the measurements and the Gaussians of one station."""
+    points = [viewed.box()]  # where was measured, and the ends that stand
+    points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    if viewed.site.static_end is None:
+        points.append(viewed.site.box + viewed.site.origin)
+    frame = Frame.around(np.concatenate(points))
+    extent = EXTENT / frame.scale
+    parts: list[Part] = []
+    legends: dict[str, Legend] = {}
+    ground = ground_of(viewed, building)
+    if building.plan is not None:
+        corners = np.column_stack([building.plan.corners(), np.full(4, ground - BENEATH * extent)])
+        edges = corners[1] - corners[0], corners[3] - corners[0]
+        parts.append(Sheet("floor plan", corners[0], *edges, building.plan.image))
+    if building.walls is not None:
+        parts += walls_faces(building.walls)
+    if measured is not None:
+        parts += _measured_parts(measured, legends, extent)
+    for name in viewed.stations:
+        place = viewed.still(name)
+        if place is not None:
+            named = len(viewed.stations) <= MOST_NAMES or name == station
+            text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
+            parts.append(Mark(f"station {name or ''}".strip(), place, text))
+    objects = viewed.predictor_of(station).method.objects()
+    origin = viewed.site.origin
+    parts += [
+        _mesh(f"mirror {number}", [_square(plane, frame.middle - origin, extent) + origin], MIRROR, 0.12)
+        for number, plane in enumerate(objects.planes)
+    ]
+    parts += _boxes("box", objects.boxes + origin)
+    cloud = cloud_of(viewed, station, measured)
+    if cloud is not None:
+        parts += _cloud_parts(cloud, legends, extent)
+    hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
+    faces = np.array(box_faces(*viewed.box()))
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
+    title = f"{viewed.site.name}, {viewed.predictor.method.label}"
+    title += "" if station is None else f": {station}"
+    beneath = ground - 2 * BENEATH * extent
+    return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
+
+
+def ground_of(viewed: Viewed, building: Building) -> float:
+    """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
+    low = [float(viewed.box()[0, 2])]
+    if viewed.site.kind in MAPPED:
+        low.append(viewed.heights()[0])
+    if building.walls is not None:
+        low += [float(face[:, 2].min()) for face in building.walls.faces]
+        low += [float(box[0, 2]) for box in building.walls.boxes]
+    return min(low)
+
+
+def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
+    chosen = evenly(len(measured.places), MOST_POINTS)
+    places, values = measured.places[chosen], measured.values[chosen]
+    size = dot_size(places, extent)
+    legends[VALUES] = Legend.over(measured.label, values)
+    parts: list[Part] = [Points(VALUES, places, legends[VALUES].of(values), size)]
+    if np.isfinite(measured.errors).any():
+        few = np.flatnonzero(np.isfinite(measured.errors))
+        psnr = measured.error_label.startswith("PSNR")
+        legends[ERRORS] = Legend.over(measured.error_label, measured.errors, "magma" if psnr else "magma_r")
+        colours = legends[ERRORS].of(measured.errors[few])
+        parts.append(Points(ERRORS, measured.places[few], colours, 1.4 * size))
+    return parts
+
+
+def dot_size(places: np.ndarray, extent: float) -> float:
+    """Width of dots [m]: the distance between neighbours, within bounds that can be seen."""
+    apart = extent / 100
+    if len(places) > 1:
+        distance = cKDTree(places).query(places[:: max(1, len(places) // 2000)], k=2)[0][:, 1]
+        apart = float(np.median(distance[distance > 0])) if (distance > 0).any() else apart
+    return float(np.clip(apart, extent / 250, extent / 80))
+
+
+def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> list[Part]:
+    legend, colours = cloud_colours(cloud)
+    legends[GAUSSIANS] = legends[SPLATS] = legend
+    size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
+    return [
+        Points(GAUSSIANS, cloud.means, colours, size),
+        Splats(SPLATS, cloud.means, cloud.covariances(), colours, SHADE * cloud.opacities),
+    ]
+
+
+def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
+    """What colours mean, and those (N, 3) uint8 of Gaussians by emission, below the strongest."""
+    most = float(np.abs(cloud.strengths).max(initial=0.0))
+    level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
+    legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
+    return legend, legend.of(level)
+
+
+@torch.no_grad()
+def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
+    """Gaussians that are rendered, in world coordinates; None: of a model without."""
+    predictor = viewed.predictor_of(station)
+    method, site = predictor.method, predictor.site
+    if isinstance(method, HasGaussians):
+        try:
+            cloud = method.gaussians(_query(site, measured))
+            return replace(cloud, means=cloud.means + site.origin)
+        except ValueError:
+            pass  # of this kind are only some of those that it fits
+    return None
+
+
+def _query(site: Site, measured: Measured | None) -> Query:
+    """Local places of both ends at which emissions are asked."""
+    box = site.moving_box[:, -3:]
+    places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
+    if measured is not None:
+        places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin
+    moving = torch.from_numpy(places).float()
+    if site.static_end is None:
+        return Query(torch.from_numpy(site.box.mean(0)).float().expand_as(moving), Pose.identity(moving))
+    return Query.at(site, moving)
+
+
+def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
+    """Corners (4, 3) of a square of a plane (4,) around the foot of a place (3,)."""
+    length = np.linalg.norm(plane[:3])
+    normal = plane[:3] / length
+    foot = middle - (normal @ middle - plane[3] / length) * normal
+    one = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    one /= np.linalg.norm(one)
+    two = np.cross(normal, one)
+    return foot + side / 2 * np.array([-one - two, one - two, one + two, two - one])
+
+
+def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
+    """Flat faces (C, 3) as triangles."""
+    triangles = fans(faces)
+    return Faces(
+        name, triangles.reshape(-1, 3), np.arange(triangles.size // 3).reshape(-1, 3), colour, opacity
+    )
+
+
+def walls_faces(walls: SceneWalls) -> list[Part]:
+    """Known walls as one mesh, and boxes."""
+    parts: list[Part] = [_mesh("walls", walls.faces, WALL, 0.4)] if walls.faces else []
+    return parts + _boxes("known box", walls.boxes)
+
+
+def _boxes(name: str, boxes: np.ndarray) -> list[Part]:
+    return [_mesh(f"{name} {number}", box_faces(*box), BOX, 0.35) for number, box in enumerate(boxes)]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Directions around a receiver in which power is drawn.
+
+    Attributes:
+        rows, columns: of a spectrum, that are drawn.
+        offsets: (n, 3) [m], world, from the receiver.
+        size: of a dot [m].
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    offsets: np.ndarray
+    size: float
+
+    @classmethod
+    def of(cls, site: Site, extent: float) -> Sphere:
+        """Of a site of spectra; not more than `DIRECTIONS`."""
+        assert site.grid is not None
+        directions = site.grid.directions().numpy()
+        every = max(1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS))))
+        row, column = (
+            a.reshape(-1) for a in np.mgrid[0 : directions.shape[0] : every, 0 : directions.shape[1] : every]
+        )
+        turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+        radius = RADIUS * extent
+        offsets = radius * directions[row, column] @ turn.T
+        return cls(row, column, offsets, radius * 2.2 * np.sqrt(np.pi / max(len(row), 1)) * 1.2)
+
+    def colours(self, spectrum: np.ndarray) -> np.ndarray:
+        """(n, 3) uint8 of a spectrum (H, W) in [0, 1]."""
+        return Legend("", 0.0, 1.0, "inferno").of(spectrum[self.rows, self.columns])
+
+
+def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
+    """Paths as lines from the receiver towards where they come from, as long as their delays, and the sources
+    at the ends of those that are drawn whole.
+
+    A line is straight where the path has bounced: its end is the image of the transmitter.
+    """
+    paths, receiver = answer.paths, answer.ends.get("rx")
+    if paths is None or paths.towards is None or receiver is None:
+        return None
+    length = paths.delay_ns * 1e-9 * LIGHT
+    reach = np.minimum(length, REACH * extent)
+    ends = receiver + paths.towards * reach[:, None]
+    colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))
+    segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
+    return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)
+
+
+def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
+    """World place (3,) [m] where the moving end first stands: the measured one nearest to their median."""
+    if measured is None:
+        return viewed.box().mean(axis=0)
+    middle = np.median(measured.places, axis=0)
+    return np.asarray(measured.places[int(np.linalg.norm(measured.places - middle, axis=1).argmin())])

@@ -1,0 +1,117 @@
+"""Predicted power over a plane: coarse at once, then finer, in steps that others may come between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.making import levels_at
+from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.reasons import Usual
+from gsparc.apps.view.scene import Sheet
+from gsparc.prediction.predictor import Predictor
+
+FIRST = 400  # cells of the first, coarsest picture, about
+STEP_S = 0.03  # of a step: what a drag waits for [s]
+LEAST = 16  # cells of a step
+OPACITY = 0.9
+APART = 0.1  # of a plane's width, between weak places that are visited
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A picture of power over a plane, so far.
+
+    Attributes:
+        grid: the cells.
+        level_db: (ny, nx), each cell with the level of the nearest that was asked about.
+        stride: cells between those; 1: all were.
+    """
+
+    grid: Grid
+    level_db: np.ndarray
+    stride: int
+
+
+def thinned(grid: Grid, most: int) -> Grid:
+    """At most about `most` cells along the longer side, of every n-th row and column."""
+    every = max(1, -(-max(grid.shape) // most))
+    return Grid(
+        grid.x[::every], grid.y[::every], grid.height, grid.step * every, grid.inside[::every, ::every]
+    )
+
+
+def refining(
+    predictor: Predictor, grid: Grid, other: Sequence[float] | None = None
+) -> Iterator[Plane | None]:
+    """Planes of ever smaller strides; None between them, about every `STEP_S`.
+
+    `other` (3,) is the transmitter's world place [m] where both ends move.
+    """
+    ny, nx = grid.shape
+    level = np.full(grid.shape, np.nan)
+    stride = 1 << max(0, int(np.ceil(np.log2(max(np.sqrt(nx * ny / FIRST), 1.0)))))
+    row, column = np.mgrid[0:ny, 0:nx]
+    done, chunk = np.zeros(grid.shape, bool), LEAST
+    while stride:
+        chosen = (row % stride == 0) & (column % stride == 0) & ~done & grid.inside
+        cells, start = np.flatnonzero(chosen), 0
+        while start < len(cells):
+            begin, part = time.perf_counter(), cells[start : start + chunk]
+            level.reshape(-1)[part] = levels_at(predictor, grid.places(part), other)[0]
+            start += len(part)
+            took = time.perf_counter() - begin
+            chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
+            yield None
+        done |= chosen
+        yield Plane(grid, _spread(level, stride, grid), stride)
+        stride //= 2
+
+
+def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
+    """Every cell with the level of the asked one whose block it is in."""
+    ny, nx = grid.shape
+    coarse = level[::stride, ::stride]
+    repeated = np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:ny, :nx]
+    return np.where(grid.inside, np.where(np.isfinite(level), level, repeated), np.nan)
+
+
+def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
+    """A picture of values (ny, nx) over the cells, clear where they are not finite, `beneath` [m] lower.
+
+    Half a dot lower, dots of the same height are seen whole.
+    """
+    clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
+    image = np.concatenate([legend.of(values), clear], axis=-1)
+    left, right, low, high = grid.extent
+    return Sheet(
+        name, np.array([left, high, grid.height - beneath]), np.array([right - left, 0.0, 0.0]),
+        np.array([0.0, low - high, 0.0]), image[::-1],
+    )  # fmt: skip
+
+
+def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
+    """World place (3,) [m] of the cell of least power, `APART` of the plane's width from places `seen` (3,).
+
+    None where there is none.
+    """
+    level = np.where(plane.grid.inside, plane.level_db, np.nan)
+    left, right, low, high = plane.grid.extent
+    for x, y, _ in seen:
+        distance = np.hypot(plane.grid.x - x, plane.grid.y[:, None] - y)
+        level[distance < APART * max(right - left, high - low)] = np.nan
+    if not np.isfinite(level).any():
+        return None
+    return plane.grid.places(np.array([int(np.nanargmin(level))]))[0]
+
+
+def beyond_distance(plane: Plane, known: Usual, other: np.ndarray) -> Plane:
+    """What is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
+    grid = plane.grid
+    cells = np.arange(plane.level_db.size)
+    distance = np.linalg.norm(grid.places(cells) - other, axis=1).reshape(grid.shape)
+    return replace(plane, level_db=plane.level_db - known.at(distance))

@@ -1,0 +1,341 @@
+"""One client: what it sees, what it may drag, and the answers that follow its hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.answer import Answer, ask
+from gsparc.apps.view.building import (
+    ERRORS,
+    GAUSSIANS,
+    PATHS,
+    RAYS,
+    SPHERE,
+    SPLATS,
+    VALUES,
+    rays_of,
+)
+from gsparc.apps.view.latest_job import LatestJobQueue
+from gsparc.apps.view.panel import panel_image
+from gsparc.apps.view.plane import Plane, beyond_distance, refining, sheet, weakest
+from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
+from gsparc.apps.view.scene import EXTENT, Points
+from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.site_view import SiteView
+
+PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
+FIRST_PLACE, WEAKEST = "first place", "next weak place"
+PLANE = "plane"
+CLOUD = {"points": GAUSSIANS, "ellipsoids": SPLATS}
+
+
+class Session:
+    """Everything of one client; callbacks only note what is wanted, a `LatestJobQueue` does it."""
+
+    def __init__(self, client: Any, view: SiteView, work: LatestJobQueue) -> None:
+        self.client, self.view, self.work = client, view, work
+        self.site = view.viewed.site
+        self.station = self.chosen_station = view.viewed.stations[0]
+        self.one = view.station(self.station)
+        self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
+        self.answers = 0  # that were shown
+        self.plane: Plane | None = None
+        self.visited: list[np.ndarray] = []  # weak places of it, one after another
+        self.power: Legend | None = None  # of the plane, where it is predicted
+        self.nodes: dict[str, Any] = {}
+        self.gizmos: dict[str, Any] = {}
+        self.sphere = view.sphere(self.station)
+        self.map_layers: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # as they are chosen
+        for grid, one in view.layers:
+            self.map_layers[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
+        self._draw_still()
+        first_view(client.camera)
+        self._panel()
+        self._add_gizmos()
+        self.want_answer()
+        self.want_plane()
+
+    @property
+    def scene(self) -> Any:
+        """Of the station that is shown."""
+        return self.one.scene
+
+    # -- drawing what stands still -----------------------------------------------------------------
+
+    def _draw_still(self) -> None:
+        api = self.client.scene
+        api.set_up_direction("+z")
+        self.nodes = draw_scene(api, self.scene, self.nodes)
+        self.cell = floor(api, self.scene)
+        if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
+            around = self.scene.frame.middle + self.sphere.offsets
+            dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
+            self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
+
+    def _add_gizmos(self) -> None:
+        for end, place in self.places.items():
+            gizmo = self.client.scene.add_transform_controls(
+                f"/{end}", scale=0.2 * EXTENT, disable_rotations=True, depth_test=False,
+                position=self.scene.frame.drawn(place),
+            )  # fmt: skip
+            self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
+            self.client.scene.add_label(
+                f"/{end}/name", ENDS[end], position=(0, 0, 0.03 * EXTENT), anchor="bottom-center"
+            )
+            gizmo.on_update(self._dragged(end))
+            self.gizmos[end] = gizmo
+
+    # -- the panel ---------------------------------------------------------------------------------
+
+    def _panel(self) -> None:
+        gui, viewed = self.client.gui, self.view.viewed
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.title = gui.add_markdown(f"**{self.scene.title}**")
+        if len(viewed.stations) > 1:
+            names = tuple(str(name) for name in viewed.stations)
+            choice = gui.add_dropdown("station", names, initial_value=names[0])
+            choice.on_update(lambda event: self._station_changed(event.target.value))
+        self.answer_text = gui.add_markdown("asking ...")
+        self.picture: Any = None
+        self.vectors = {}
+        for end, place in self.places.items():
+            vector = gui.add_vector3(f"{ENDS[end]} [m]", tuple(np.round(place, 3)), step=0.01)
+            self._on(vector, partial(self._move, end))
+            self.vectors[end] = vector
+        row = [FIRST_PLACE] + ([WEAKEST] if self.view.grid is not None else [])
+        buttons = gui.add_button_group("go to", row)
+        buttons.on_click(lambda event: self._go(event.target.value))
+        with gui.add_folder("Colours"):
+            self.legend = gui.add_html("")
+        self._layers_panel(gui)
+        with gui.add_folder("Notes", expand_by_default=False):
+            gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
+        self._legends()
+
+    def _layers_panel(self, gui: Any) -> None:
+        with gui.add_folder("Shown"):
+            has = {name: self.scene.part(name) is not None for name in (VALUES, ERRORS, GAUSSIANS)}
+            if has[VALUES]:
+                points = {"values": VALUES, **({"errors": ERRORS} if has[ERRORS] else {})}
+                chosen = gui.add_dropdown("measured points", (*points, NOTHING), initial_value="values")
+                self._on(chosen, partial(self._show_only, points))
+            if has[GAUSSIANS]:
+                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._show_only, CLOUD))
+            self.chosen: Any = None
+            if self.view.grid is not None or self.map_layers:
+                known = self.one.about.usual
+                far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
+                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.map_layers)
+                self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
+                self._on(self.chosen, lambda value: self.want_plane())
+                self.progress = gui.add_markdown("")
+            if self.view.grid is not None:
+                low, high = self.view.viewed.heights()
+                first = round(self.view.grid.height, 2)
+                self.height = gui.add_slider("height [m]", min(low, first), max(high, first), 0.01, first)
+                self._on(self.height, lambda value: self.want_plane())
+
+    def _notes(self) -> list[str]:
+        notes = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        if self.site.static_end is not None:
+            notes.append(
+                f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
+            )
+        else:
+            notes.append(
+                "both ends moved: measured points are where the receiver was, wherever its transmitter"
+            )
+        return notes
+
+    def _on(self, handle: Any, act: Any) -> None:
+        """Do something with a value that the client changed, not with one that we set."""
+
+        async def changed(event: Any) -> None:
+            if event.client is not None:
+                act(event.target.value)
+
+        handle.on_update(changed)
+
+    # -- what the hand does ------------------------------------------------------------------------
+
+    def _dragged(self, end: str) -> Any:
+        async def moved(event: Any) -> None:
+            self.places[end] = self.scene.frame.world(event.target.position)
+            self._moved(end)
+
+        return moved
+
+    def _move(self, end: str, position: ArrayLike) -> None:
+        self.places[end] = place = np.asarray(position, np.float64)
+        self.gizmos[end].position = self.scene.frame.drawn(place)
+        self._moved(end)
+
+    def _moved(self, end: str) -> None:
+        self.want_answer()
+        if end == "tx" and self.site.static_end is None:
+            self.want_plane()  # which shows the power of this transmitter
+
+    def _go(self, where: str) -> None:
+        moving = self.view.viewed.moving[-1]
+        place = self.view.starts(self.station)[moving]
+        if where == WEAKEST and self.plane is not None:
+            weak_place = weakest(self.plane, self.visited)
+            if weak_place is None:  # all were visited
+                self.visited.clear()
+                weak_place = weakest(self.plane)
+            if weak_place is not None:
+                self.visited.append(weak_place)
+                place = weak_place
+        self._move(moving, place)
+
+    def _show_only(self, parts: Mapping[str, str], choice: str) -> None:
+        """Of parts, by the words to choose them by, show the one that was chosen alone."""
+        for word, name in parts.items():
+            self._set_visible(name, word == choice)
+        self._legends()
+
+    def _set_visible(self, name: str, visible: bool) -> None:
+        """Show or hide a part; what is hidden at first is sent when it is first shown."""
+        if name in self.nodes:
+            self.nodes[name].visible = visible
+        elif visible and (part := self.scene.part(name)) is not None:
+            self.nodes[name] = draw(self.client.scene, self.scene.frame, part)
+
+    def _station_changed(self, value: str) -> None:
+        """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
+        self.chosen_station = value
+        if not self.view.has(value):
+            self.title.content = f"**{value} is being prepared ...**"
+        self.view.station(value)
+        if self.chosen_station == value:
+            self.work.ask((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
+
+    # -- what the worker does ----------------------------------------------------------------------
+
+    def want_answer(self) -> None:
+        """Have the present places answered."""
+        self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
+
+    def want_plane(self) -> None:
+        """Have the present plane drawn."""
+        self.work.ask((self.client.client_id, PLANE), self._planes)
+
+    def _show_station(self, name: str) -> Iterator[None]:
+        self.station, self.one = name, self.view.station(name)
+        choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
+        visibility = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        with self.client.atomic():
+            self._draw_still()
+            for name, visible in visibility.items():
+                self._set_visible(name, visible)
+        self.title.content = f"**{self.scene.title}**"
+        self._legends()
+        self.want_answer()
+        self.want_plane()
+        yield
+
+    def _answered(self) -> Iterator[None]:
+        try:
+            answer = ask(self.view.viewed.predictor_of(self.station), dict(self.places))
+        except ValueError as error:
+            self.answer_text.content = f"**{error}**"
+            return
+        self._show(answer)
+        self.answers += 1
+        self.work.ask((self.client.client_id, "panel"), partial(self._panel_of, answer))
+        yield
+
+    def _show(self, answer: Answer) -> None:
+        why = reasons(answer, self.view.viewed.moving[-1], self.one.about)
+        rays, first = rays_of(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
+        with self.client.atomic():
+            self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
+            for end in self.vectors:
+                self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
+            if answer.spectrum is not None and self.sphere is not None and "rx" in answer.ends:
+                self.nodes[SPHERE].position = self.scene.frame.drawn(answer.ends["rx"])
+                self.nodes[SPHERE].colors = self.sphere.colours(answer.spectrum)
+            for part in rays:
+                self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
+        if rays and first:
+            self._legends()
+
+    def _panel_of(self, answer: Answer) -> Iterator[None]:
+        """The picture of an answer, which takes longer than the answer: a drag does not wait for it."""
+        image = panel_image(answer, self.site, self.one.about.usual, self.view.unit)
+        if self.picture is None:
+            self.picture = self.client.gui.add_image(
+                image, jpeg_quality=85, order=self.answer_text.order + 0.1
+            )
+        else:
+            self.picture.image = image
+        yield
+
+    def _planes(self) -> Iterator[None]:
+        name = NOTHING if self.chosen is None else self.chosen.value
+        self.power = None
+        if name in self.map_layers:
+            grid, *_ = self.map_layers[name]
+            self._lay(*self.map_layers[name])
+            self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
+        elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
+            grid = replace(self.view.grid, height=float(self.height.value))
+            yield from self._predicted_plane(grid, name == BEYOND)
+        elif PLANE in self.nodes:
+            self.nodes.pop(PLANE).remove()
+        self._legends()
+        yield
+
+    def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
+        predictor = self.view.viewed.predictor_of(self.station)
+        other = self.places["tx"] if self.site.static_end is None else None
+        known, there = self.one.about.usual, self._still()
+        legend, begin = None if beyond else self.one.power, time.perf_counter()
+        self.visited.clear()
+        for plane in refining(predictor, grid, None if other is None else other.tolist()):
+            if plane is None:
+                yield
+                continue
+            if beyond and known is not None and there is not None:
+                plane = beyond_distance(plane, known, there)
+                most = max(3 * known.spread_db, 1.0)
+                label = "power more than distance alone explains [dB]"
+                legend = legend or Legend(label, -most, most, "PuOr")
+            first = self.power is None
+            legend = legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db)
+            self.plane, self.power = plane, legend
+            self._lay(grid, plane.level_db, legend)
+            if first:
+                self._legends()
+            suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
+            self.progress.content = (
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}, "
+                f"{time.perf_counter() - begin:.1f} s"
+            )
+            yield
+
+    def _still(self) -> np.ndarray | None:
+        """World place (3,) [m] of the other end than the plane's."""
+        return self.places["tx"] if self.site.static_end is None else self.view.viewed.still(self.station)
+
+    def _lay(self, grid: Grid, values: np.ndarray, legend: Legend) -> None:
+        part = sheet(PLANE, grid, values, legend, self.one.dot / 2)
+        self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
+
+    def _legends(self) -> None:
+        legends = self.scene.legends
+        entries = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        entries += [PATHS] if RAYS in self.nodes else []
+        entries += [self.power] if PLANE in self.nodes and self.power is not None else []
+        name = NOTHING if self.chosen is None else self.chosen.value
+        entries += [self.map_layers[name][2]] if name in self.map_layers else []
+        self.legend.content = legend_html(entries, self.scene.parts)

@@ -1,0 +1,148 @@
+"""What all clients share of a model: scenes of stations, each made once, and where planes lie."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.levels import MAPPED
+from gsparc.apps.maps.pictures import Layer, Legend
+from gsparc.apps.view.building import VALUES, Building, Sphere, build, start_place
+from gsparc.apps.view.crossed import Obstacles
+from gsparc.apps.view.plane import Plane, refining
+from gsparc.apps.view.reasons import Surroundings, usual
+from gsparc.apps.view.scene import EXTENT, Points, Scene
+from gsparc.apps.view.viewed import Measured, Viewed
+from gsparc.data.blocks import evenly
+from gsparc.data.walls import SceneWalls
+
+
+@dataclass(frozen=True)
+class StationView:
+    """A scene of one station and what explains its answers.
+
+    Attributes:
+        scene: what stands still.
+        measured: of the station; None without data.
+        about: what is known of its places.
+        power: colours of powers: as those of the measured points, where there are any.
+    """
+
+    scene: Scene
+    measured: Measured | None
+    about: Surroundings
+    power: Legend | None
+
+    @property
+    def dot(self) -> float:
+        """Width of the dots of measured places [m]."""
+        part = self.scene.part(VALUES)
+        return part.size if isinstance(part, Points) else 0.0
+
+
+@dataclass
+class SiteView:
+    """A model as all clients see it.
+
+    Attributes:
+        viewed: the model.
+        building: floor plan and walls.
+        grid: cells of planes; None where no power is predicted.
+        layers: of a map that was made before, with its cells.
+        at: world place where the moving end first stands; None: chosen.
+        other: the same of the transmitter, where both move.
+    """
+
+    viewed: Viewed
+    building: Building = field(default_factory=Building)
+    grid: Grid | None = None
+    layers: tuple[tuple[Grid, Layer], ...] = ()
+    at: np.ndarray | None = None
+    other: np.ndarray | None = None
+    _made: dict[str | None, StationView] = field(default_factory=dict)
+    _lock: Any = field(default_factory=threading.Lock)
+
+    @property
+    def unit(self) -> str:
+        """Of powers."""
+        return self.viewed.unit
+
+    def station(self, name: str | None) -> StationView:
+        """Of a station; made when it is first asked for, which takes seconds. Those made wait for nobody."""
+        if name not in self._made:
+            with self._lock:
+                if name not in self._made:
+                    self._made[name] = self._make(name)
+        return self._made[name]
+
+    def has(self, name: str | None) -> bool:
+        """Whether a station was made."""
+        return name in self._made
+
+    def _make(self, name: str | None) -> StationView:
+        viewed = self.viewed
+        measured = viewed.measured(name)
+        scene = build(viewed, self.building, name, measured)
+        known, values = None, np.zeros(0)
+        if measured is not None:
+            values = measured.values
+            levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
+            known = usual(measured.places, levels, viewed.others(name))
+        power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
+        faces = () if self.building.walls is None else self.building.walls.faces
+        boxes = viewed.predictor_of(name).method.objects().boxes + viewed.site.origin
+        if self.building.walls is not None:
+            boxes = np.concatenate([boxes, self.building.walls.boxes])
+        walls = Obstacles.of(SceneWalls(faces, boxes)) if len(faces) or len(boxes) else None
+        about = Surroundings(known, values, walls, self.unit)
+        return StationView(scene, measured, about, power)
+
+    def extent(self, name: str | None) -> float:
+        """Width of the site [m]."""
+        return EXTENT / self.station(name).scene.frame.scale
+
+    def sphere(self, name: str | None) -> Sphere | None:
+        """Directions of a spectrum; None of other kinds."""
+        site = self.viewed.site
+        return None if site.kind != "spectrum" or site.grid is None else Sphere.of(site, self.extent(name))
+
+    def starts(self, name: str | None) -> dict[str, np.ndarray]:
+        """World places (3,) where the ends that move first stand."""
+        viewed, first = self.viewed, self.viewed.moving[-1]
+        at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
+        places: dict[str, np.ndarray] = {first: at}
+        if len(viewed.moving) > 1:
+            other = (viewed.site.box + viewed.site.origin).mean(axis=0)
+            if viewed.data is not None:
+                other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
+            places["tx"] = other if self.other is None else self.other
+        return places
+
+    def plane(self, name: str | None, grid: Grid) -> Plane:
+        """Power over all of some cells, the transmitter where it first stands if both ends move."""
+        other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
+        *_, plane = refining(self.viewed.predictor_of(name), grid, other)
+        assert plane is not None
+        return plane
+
+
+def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
+    """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
+    if viewed.site.kind not in MAPPED:
+        return None
+    return grid_of(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
+
+
+def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
+    """At most `count` measured places in the order of measuring, or along the box's diagonal."""
+    measured = view.station(name).measured
+    if measured is None:
+        low, high = view.viewed.box()
+        return [low + (high - low) * share for share in np.linspace(0.1, 0.9, count)]
+    places = measured.places
+    return list(places[evenly(len(places), count)])

@@ -1,0 +1,191 @@
+"""A checkpoint as a viewer needs it: whom to ask, and what was measured."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.apps.maps import levels
+from gsparc.apps.maps.making import answering
+from gsparc.data.blocks import evenly
+from gsparc.data.schema import End, Measurements, Site
+from gsparc.evaluation.open_runs import aligned, open_files
+from gsparc.models import loading
+from gsparc.prediction.confidence import trusted_of
+from gsparc.prediction.predictor import Predictor
+
+log = logging.getLogger(__name__)
+
+MOST_ERRORS = 2000  # test rows that errors are drawn of
+LEAST_HEIGHT_M = 0.5  # of a site, between whose floor and ceiling planes are lifted
+CHUNK = 128  # rows of one call
+LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured of one station.
+
+    Attributes:
+        places: (n, 3) world, of the moving end [m].
+        values: (n,) level [dB], or mean of a spectrum; NaN where nothing was heard.
+        label: of the values.
+        errors: (n,) of test rows, NaN for the others.
+        error_label: of the errors.
+    """
+
+    places: np.ndarray
+    values: np.ndarray
+    label: str
+    errors: np.ndarray
+    error_label: str
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """A model, and what is known of its site.
+
+    Attributes:
+        name: of the checkpoint.
+        predictor: as trained.
+        data: in the model's coordinates and units; None where they are gone.
+        test: (n,) rows that were not learned from.
+        stations: that it answers for; one, None, where there is one static end or none.
+        notes: what a reader must know, one line each.
+        unit: of powers.
+    """
+
+    name: str
+    predictor: Predictor
+    data: Measurements | None
+    test: np.ndarray
+    stations: tuple[str | None, ...]
+    notes: tuple[str, ...] = ()
+    unit: str = "dB"
+
+    @property
+    def site(self) -> Site:
+        """Of the model."""
+        return self.predictor.site
+
+    @property
+    def moving(self) -> tuple[End, ...]:
+        """Ends that can be dragged."""
+        return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
+
+    def predictor_of(self, station: str | None) -> Predictor:
+        """Of a station."""
+        return self.predictor if station is None else self.predictor.at(station)
+
+    def still(self, station: str | None) -> np.ndarray | None:
+        """World place (3,) [m] of the static end; None where it is unknown or moves."""
+        site = self.site if station is None else self.predictor.at(station).site
+        place = site.static_position
+        return None if place is None else place + site.origin
+
+    def others(self, station: str | None) -> np.ndarray | None:
+        """World places (3,) [m] of the static end, or (n, 3) of transmitters where both ends moved."""
+        if self.data is None or self.site.static_end is not None:
+            return self.still(station)
+        return np.asarray(self.data.tx[self.rows(station)] + self.site.origin)
+
+    def box(self) -> np.ndarray:
+        """(2, 3) world corners of where the moving end was [m]."""
+        return np.asarray(self.site.moving_box[:, -3:] + self.site.origin)
+
+    def heights(self) -> tuple[float, float]:
+        """Between which a plane can be lifted [m], to the centimetre."""
+        low, high = (float(z) for z in (self.site.box + self.site.origin)[:, 2])
+        if high - low <= LEAST_HEIGHT_M:
+            low, high = low - 1.5, high + 1.5
+        return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
+
+    def rows(self, station: str | None) -> np.ndarray:
+        """Rows of a station."""
+        if self.data is None:
+            return np.zeros(0, np.int64)
+        if station is None or self.data.station is None or self.site.stations is None:
+            return np.arange(len(self.data))
+        number = self.site.stations.name.index(station)
+        return np.flatnonzero(self.data.station == number)
+
+    def measured(self, station: str | None) -> Measured | None:
+        """Values and errors of a station; None without data."""
+        if self.data is None:
+            return None
+        data, rows = self.data, self.rows(station)
+        places = data.moving[rows][:, -3:] + data.site.origin
+        if data.site.kind == "spectrum":
+            chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
+            values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
+            label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
+        else:
+            values, side = levels.measured(data, rows)
+            values[side > 0] = np.nan
+            what = "received power" if data.site.kind == "rssi" else "power of a channel"
+            label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
+        errors = np.full(len(rows), np.nan)
+        tested = np.flatnonzero(np.isin(rows, self.test))
+        tested = tested[evenly(len(tested), MOST_ERRORS)]
+        for start in range(0, len(tested), CHUNK):
+            part = tested[start : start + CHUNK]
+            errors[part] = _errors(self.predictor, data, rows[part], values[part])
+        return Measured(places, values, label, errors, error_label)
+
+
+@torch.no_grad()
+def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
+    batch = data.batch(rows)
+    prediction = predictor.method.predict(batch)
+    if data.site.kind == "spectrum":
+        square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
+        return -10 * np.log10(np.maximum(square, LEAST_RATIO))
+    mean = replace(prediction, variance=None)
+    return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
+
+
+def open_viewed(
+    path: str | Path,
+    dataset: Mapping[str, Any] | None = None,
+    station: str | int | None = None,
+    unit: str | None = None,
+) -> Viewed:
+    """Read a checkpoint, and its data where they are still there.
+
+    Args:
+        path: of the checkpoint.
+        dataset: settings that replace those stored.
+        station: the only one to show; None: all that the model answers for.
+        unit: of powers; None: as measured.
+
+    Raises:
+        DataError: no station is called that.
+        ValueError: no checkpoint that can be read.
+    """
+    notes: list[str] = []
+    data, test = None, np.zeros(0, np.int64)
+    try:
+        run = open_files([path], dataset)
+        method, stored, data = run.methods[0], run.stored[0], run.data
+        if run.foreign is None:
+            test = run.split.folds[0].test
+        else:
+            notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
+    except (ValueError, OSError) as error:
+        method, stored = loading.load(path)
+        notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
+    site, trusted = stored.site.in_levels(unit), trusted_of(stored.extra)
+    data = None if data is None else aligned(data, site)
+    predictor = Predictor(method, site, trusted=trusted, extra=stored.extra)
+    names, missing = answering(predictor, None if station is None else [station], key="station")
+    for note in missing:
+        log.warning(note)
+    stations = tuple(name or None for name in names)
+    return Viewed(str(path), predictor, data, test, stations, tuple(notes), site.level_unit)

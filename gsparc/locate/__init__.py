@@ -1,1 +1,0 @@
-"""Where something was heard: places by the likelihood of a learned field."""

@@ -1,0 +1,100 @@
+"""Methods whose weights are known in closed form once Gaussians and covariances are: conditioned on rows.
+
+Searches and likelihoods find places, sizes and covariance parameters; the weights follow from the training
+rows as in a Gaussian process (Rasmussen and Williams 2006, section 2.2), of which such a method is one: its
+covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it is the plain process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.method import Method
+from gsparc.training.context import FitContext
+
+
+@dataclass(frozen=True)
+class LeftOutRows:
+    """Training rows predicted from all others (Rasmussen and Williams 2006, eq. 5.12).
+
+    Attributes:
+        rows: (n,) of the measurements.
+        mean: (n, ...) predictions, stored units.
+        variance: (n,) expected squared error per entry.
+    """
+
+    rows: np.ndarray
+    mean: Tensor
+    variance: Tensor
+
+
+_KINDS: dict[str, type[ClosedForm]] = {}  # by the name that `stored` gives them
+
+
+class ClosedForm(Method):
+    """A method that can be conditioned on other rows, and predict rows from all others.
+
+    Subclasses that are parts of stored methods give `kind`, by which `restored` knows them.
+
+    Attributes:
+        held: rows of groups, predicted by searches that left their group out; None where none did.
+        forgets: whether `condition` on other rows leaves nothing of earlier ones but a few numbers.
+    """
+
+    kind_stored: ClassVar[str]
+    held: LeftOutRows | None = None
+    forgets = False
+
+    def __init_subclass__(cls, kind: str = "", **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        if kind:
+            cls.kind_stored, _KINDS[kind] = kind, cls
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians; 0 where a process is all there is."""
+        return self.size()
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""
+        return ("residual",)
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """Set the weights from rows (n,); settings are chosen anew where that costs little."""
+        self.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+
+    def left_out(self) -> LeftOutRows:
+        """Return the rows it was conditioned on, each predicted from the others.
+
+        Raises:
+            ValueError: not conditioned yet, or they are not kept.
+        """
+        raise ValueError(f"{self.name}: rows left out are not kept")
+
+    def gradient_problem(self) -> str | None:
+        """None; see `Method.gradient_problem`."""
+        return None
+
+    def parts(self) -> Iterator[tuple[float, ClosedForm]]:
+        """Yield methods that are no mixtures, with their weights in the mean."""
+        yield 1.0, self
+
+
+def stored(method: ClosedForm) -> dict[str, Any]:
+    """What `restored` reads."""
+    return {"kind": method.kind_stored, "state": method.state()}
+
+
+def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
+    """The method whose `stored` state this was."""
+    method = _KINDS[str(state["kind"])]()
+    method.restore(site, state["state"])
+    return method

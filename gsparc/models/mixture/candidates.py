@@ -1,0 +1,87 @@
+"""Methods in closed form by the names that `init=` and mixtures have for them, unfitted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from gsparc.data.walls import read_walls
+from gsparc.field.initial import InitSettings
+from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.channels.complex_gp import ComplexGP
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.closed_form import ClosedForm
+from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.image_sources.known.method import KnownWallsGP
+from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.mixture.residual import Residual
+from gsparc.models.moving_array.method import MovingArrayField
+from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.powers.field import PowerField
+from gsparc.models.powers.together.field import JointPowerField
+from gsparc.training.context import FitContext
+
+# `(init, clutter, residual, context) -> method`: whether obstacles, and a process beside sources, are sought.
+Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
+
+
+def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+    """Image sources of several searches, and a process on what they leave."""
+    method = ImageSourceGP(**_searched(init, clutter, context))
+    return Residual(method) if residual else method
+
+
+def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+    """Images of the static end in the walls of `init.file`.
+
+    Raises:
+        DataError: no such file, or walls that cannot be.
+    """
+    method = KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
+    return Residual(method) if residual else method
+
+
+def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+    """Coherent waves, or what the path loses in walls of a file (`init=scene`), and a process of the rest.
+
+    Raises:
+        DataError: `init=scene` without a file, or walls that cannot be.
+    """
+    walls = read_walls(init.file) if init.name == "scene" else None
+    return PowerField(init.name != "diffuse", context.seed, walls)
+
+
+def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+    """Powers of several stations in one process; without `clutter` they share their law alone."""
+    return JointPowerField(clutter and init.name != "diffuse", context.seed)
+
+
+def bearings(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+    """Sources where bearings cross, of at most `init.searches` searches."""
+    search = replace(SearchSettings(), sources=init.max_sources)
+    searches = max(round(init.searches * context.effort), 1)
+    return MovingArrayField(search=search, seed=context.seed, searches=searches)
+
+
+def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
+    """What `ImageSourceGP` takes, of the settings of an initialiser."""
+    names = ("searches", "search_rows", "rows", "margin", "max_sources", "order")
+    own = {name: getattr(init, name) for name in names}
+    own["searches"] = max(round(context.effort * init.searches), 1)
+    for name in ("search_rows", "rows"):
+        own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
+    return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
+
+
+CANDIDATES: dict[str, Candidate] = {
+    "sources": sources,
+    "scene": scene,
+    "rays": lambda init, clutter, residual, context: DirectionalGP(init.rows, context.seed),
+    "diffuse": lambda *unused: ChannelField(),
+    "powers": powers,
+    "joint_powers": joint_powers,
+    "bearings": bearings,
+    "process": lambda *unused: GaussianProcess(),
+    "aligned": lambda *unused: ComplexGP(),
+}

@@ -1,0 +1,367 @@
+"""A threshold with a promise: at most a share alpha of accepted positions is bad, with confidence 1 - delta.
+
+Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing: thresholds are
+tried from strict to lax, each is a binomial test on the calibration positions it accepts, and the first that
+fails ends the search. Given who is accepted the bad ones are binomial, so the promise is about the error
+*among accepted positions*; plain split conformal promises a share of all positions instead. Whether promises
+hold is told by `trials`: thresholds of many draws, tried on other rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy.special import betainc
+from scipy.stats import beta, chi2, spearmanr
+
+from gsparc.data.splits import far_apart
+
+RIVALS = ("distance", "gp_variance")
+KINDS = ("learned", "expected", *RIVALS)
+LEVELS = 50
+SURE_OF_EFFECT = 0.8
+How = Literal["random", "spatial"]
+SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
+CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Positions a method did not learn from.
+
+    Attributes:
+        row: (n,) rows of the dataset.
+        position: (n, 3) [m].
+        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
+        scores: by kind, (n,) each, larger is surer.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    error: np.ndarray
+    scores: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Folds together; scores that not every part has are dropped."""
+    kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
+    scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
+    facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
+    row, position, error = map(np.concatenate, facts)
+    return Evidence(row, position, error, scores)
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What is promised.
+
+    Attributes:
+        limit_db: a prediction is bad when |e|^2 / |h|^2 exceeds this [dB].
+        alpha: largest share of bad ones among the accepted.
+        delta: probability that a calibration set misleads.
+    """
+
+    limit_db: float = -10.0
+    alpha: float = 0.1
+    delta: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (0 < self.alpha < 1 and 0 < self.delta < 1):
+            raise ValueError(f"promise: alpha={self.alpha} and delta={self.delta} must lie between 0 and 1")
+
+    @property
+    def least(self) -> int:
+        """Positions that must be accepted, all of them good, before anything can be promised."""
+        return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
+
+    def bad(self, relative_error: np.ndarray) -> np.ndarray:
+        """Whether predictions (n,) are bad."""
+        return relative_error > 10 ** (self.limit_db / 10)
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A threshold and what it was chosen on.
+
+    Attributes:
+        value: accept scores of at least this; infinite when nothing can be promised.
+        accepted: calibration positions it accepts.
+        bad: how many of them are bad.
+    """
+
+    value: float
+    accepted: int
+    bad: int
+
+    def bound(self, delta: float) -> float:
+        """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
+        return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
+
+
+def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:
+    """Clopper and Pearson's interval (1934) of a rate."""
+    if count == 0:
+        return 0.0, 1.0
+    tail = (1 - level) / 2
+    low = 0.0 if errors == 0 else float(beta.ppf(tail, errors, count - errors + 1))
+    high = 1.0 if errors == count else float(beta.ppf(1 - tail, errors + 1, count - errors))
+    return low, high
+
+
+def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
+    """Thresholds (at most `count`,) to try, strict to lax: quantiles of scores (n,) not the calibration's."""
+    return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
+
+
+def choose(
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    promise: Guarantee,
+    group: np.ndarray | None = None,
+) -> Threshold:
+    """The laxest threshold that the calibration set (n,) supports.
+
+    Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
+    by the design effect, how much more the share varies between patches than binomial counts would (Kish
+    1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
+    could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
+    """
+    threshold = Threshold(float("inf"), 0, 0)
+    for level in levels:
+        rows = score >= level
+        accepted, wrong = int(rows.sum()), int(bad[rows].sum())
+        if accepted < promise.least:
+            continue
+        effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
+        if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
+            break
+        threshold = Threshold(float(level), accepted, wrong)
+    return threshold
+
+
+def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
+    """Variance of the share of bad ones (n,) between groups (n,) over that of independent draws; at least 1.
+
+    A variance between few groups is itself uncertain: what is returned is its one-sided bound at
+    `SURE_OF_EFFECT`, as of a normal variance.
+    """
+    _, which = np.unique(group, return_inverse=True)
+    counts, wrong = np.bincount(which), np.bincount(which, bad)
+    share, groups = wrong.sum() / counts.sum(), len(counts)
+    if groups < 2 or share in (0.0, 1.0):
+        return 1.0
+    between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
+    bound = (groups - 1) / chi2.ppf(1 - SURE_OF_EFFECT, groups - 1)
+    return max(1.0, float(bound * between / (share * (1 - share))))
+
+
+def _tail(wrong: float, accepted: float, alpha: float) -> float:
+    """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
+    return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
+
+
+def bounded(relative_error: np.ndarray) -> np.ndarray:
+    """Losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
+    return np.minimum(relative_error, 1.0)
+
+
+def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
+    """Mean loss of the 1, 2, ..., n surest of n predictions, (n,).
+
+    Its mean is the area under risk against coverage (Geifman, Uziel and El-Yaniv 2019). Equal scores share
+    their mean loss: their order cannot matter.
+
+    Args:
+        score: (n,), larger is surer.
+        loss: (n,).
+    """
+    order = np.argsort(-score, kind="stable")
+    _, group = np.unique(-score[order], return_inverse=True)
+    shared = (np.bincount(group, loss[order].astype(np.float64)) / np.bincount(group))[group]
+    return np.cumsum(shared) / np.arange(1, len(score) + 1)
+
+
+def rank_correlation(score: np.ndarray, loss: np.ndarray) -> float | None:
+    """Spearman's correlation of being sure (n,) and being right, minus the loss (n,); None of a constant."""
+    if np.ptp(score) == 0 or np.ptp(loss) == 0:
+        return None
+    return float(spearmanr(score, -loss).statistic)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What many calibration sets led to.
+
+    Attributes:
+        kind: confidence used.
+        how: how positions were divided.
+        realised: (draws,) share of bad ones among accepted test positions; NaN where none was accepted.
+        coverage: (draws,) share of test positions accepted.
+        alpha: largest share of bad ones that was guaranteed.
+    """
+
+    kind: str
+    how: How
+    realised: np.ndarray
+    coverage: np.ndarray
+    alpha: float
+
+    def facts(self) -> dict[str, Any]:
+        """Figures over the draws; None of those that nothing was accepted in.
+
+        `broken` is the share of draws with more than alpha bad ones, of the draws that accepted anybody, with
+        Clopper and Pearson's 95 % interval as if they were independent (they share their positions: it is the
+        least that chance allows for). Delta bounds the share of *all* draws, `broken_of_all`: where most
+        accept nobody, those that do are the ones that chance flattered. `silent` is the share that did not.
+        """
+        accepting = self.realised[~np.isnan(self.realised)]
+        bad = accepting > self.alpha
+        low, high = binomial_interval(int(bad.sum()), len(accepting)) if len(accepting) else (None, None)
+        return {
+            "kind": self.kind, "broken": float(bad.mean()) if len(accepting) else None, "broken_low": low,
+            "broken_high": high, "broken_of_all": float(bad.sum() / len(self.realised)),
+            "silent": float(np.isnan(self.realised).mean()),
+            "realised": float(accepting.mean()) if len(accepting) else None,
+            "coverage": float(self.coverage.mean()), "draws": len(self.realised),
+        }  # fmt: skip
+
+
+def divided(
+    evidence: Evidence, how: How, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Disjoint rows of the evidence: to choose on, to calibrate on, to test on.
+
+    `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
+    across a cell's border.
+
+    Raises:
+        ValueError: too few positions, or patches, for three parts.
+    """
+    unit = np.arange(len(evidence)) if how == "random" else cells(evidence.position)
+    order = rng.permutation(unit.max(initial=-1) + 1)
+    first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
+    if not 0 < first < second < len(order):
+        what = "positions" if how == "random" else "patches of the plane"
+        raise ValueError(
+            f"{len(order)} {what} cannot be parted into those to choose on, to calibrate on and to test on: "
+            f"take more test rows{'' if how == 'random' else ', or spatial=false'}"
+        )
+    parts = order[:first], order[first:second], order[second:]
+    choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
+    return choose_on, calibrate, test
+
+
+def too_few(count: int, promise: Guarantee) -> str | None:
+    """What is missing for any promise on so many positions; None where there are enough."""
+    needed = int(np.ceil(promise.least / SHARES[1]))
+    if count >= needed:
+        return None
+    return (
+        f"{count} test positions can promise nothing: alpha={promise.alpha:g}, delta={promise.delta:g} need "
+        f"{promise.least} good ones to calibrate on, {needed} in all; measure more, or promise less"
+    )
+
+
+def laxer(evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int) -> Guarantee | None:
+    """The same promise with the least larger limit, in whole decibels, that these positions keep; or None."""
+    for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
+        other = replace(promise, limit_db=float(limit))
+        if np.isfinite(accept(evidence, other, kind, spatial, seed)[1].value):
+            return other
+    return None
+
+
+def cells(position: np.ndarray) -> np.ndarray:
+    """Which patch of the plane each position (n, 3) lies in: (n,) numbers from 0; on a plumb line, of it."""
+    flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
+    low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
+    cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
+    return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
+
+
+def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
+    """The confidence of the smallest area under risk-coverage on `rows`."""
+    loss = bounded(evidence.error[rows])
+    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
+
+
+def accept(
+    evidence: Evidence,
+    promise: Guarantee,
+    kind: str,
+    spatial: bool,
+    seed: int | list[int],
+    apart_m: float = 0,
+) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
+    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
+
+    Raises:
+        ValueError: `kind` is no confidence of this evidence.
+    """
+    rng = np.random.default_rng(seed)
+    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
+    used = best_kind(evidence, choose_on) if kind == "auto" else kind
+    if used not in evidence.scores:
+        raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
+    score, bad = evidence.scores[used], promise.bad(evidence.error)
+    if apart_m > 0:  # neighbours err together and count as one
+        calibrate = far_apart(evidence.position, calibrate, apart_m, rng)
+    patch = cells(evidence.position)[calibrate] if spatial else None
+    threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    return used, threshold, test, choose_on
+
+
+def trials(
+    evidence: Evidence, promise: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
+    seed: int = 0,
+) -> Trial:  # fmt: skip
+    """Resample `draws` calibration sets.
+
+    Args:
+        evidence: positions the method did not learn from.
+        promise: what every threshold promises.
+        how: `random` or `spatial` division.
+        draws: calibration sets.
+        kind: a confidence, or `auto`: the best on the positions set aside for choosing.
+        apart_m: calibration positions nearer to each other than this are thinned [m].
+        seed: of the draws.
+    """
+    realised, coverage, kinds = [], [], []
+    bad = promise.bad(evidence.error)
+    for draw in range(draws):
+        used, threshold, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
+        accepted = test[evidence.scores[used][test] >= threshold.value]
+        kinds.append(used)
+        realised.append(bad[accepted].mean() if len(accepted) else np.nan)
+        coverage.append(len(accepted) / max(len(test), 1))
+    most = max(set(kinds), key=kinds.count)
+    return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
+
+
+def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
+    """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
+    loss = bounded(evidence.error)
+    perfect = risk_coverage(-loss, loss).mean()
+    facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": float(perfect)}
+    risks = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}
+    bar = float(risks["distance"].mean())
+    for kind, risk in risks.items():
+        area = float(risk.mean())
+        own = {
+            "area": area, "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
+            "rank_correlation": rank_correlation(evidence.scores[kind], loss),
+            "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
+        }  # fmt: skip
+        facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
+    facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
+    for trial in trials:
+        facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.facts().items()}
+    return facts

@@ -1,0 +1,114 @@
+"""A scenario of DeepMIMO, read back as its loader reads it: channels, and geometry of a known mirror."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from gsparc.apps.export.along import deepmimo
+from gsparc.data.schema import LIGHT
+from gsparc.prediction.channels import Paths
+
+CARRIER = 3.5e9
+STILL = np.array([100.0, 50, 8])
+WALL = 120.0  # a mirror in x
+
+
+class Site:
+    kind, moving_end, origin, static_position = "csi", "rx", np.array([100.0, 50, 0]), np.array([0.0, 0, 8])
+
+
+class Mirror:
+    site = Site()
+
+    def paths(self, rx):
+        sources = np.array([STILL, [2 * WALL - STILL[0], STILL[1], STILL[2]], [0, 0, 0]])
+        away = sources - rx[:, None]
+        far = np.linalg.norm(away, axis=-1)
+        gain = 1e-2 / far * np.exp(-2j * np.pi * CARRIER * far / LIGHT) * [1, 0.5, 0]
+        return Paths(gain[:, None].astype(np.complex64), far[:, None] / LIGHT, CARRIER, None,
+                     away / far[..., None])  # fmt: skip
+
+
+PLACES = np.array([[110.0, 60, 1.5], [95.0, 41, 2.0]])
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    """By the names that DeepMIMO's loader makes: `{key}_t{set}_tx{index}_r{set}.npz`, one array called so."""
+    assert deepmimo.write(tmp_path, Mirror(), PLACES)[0] == 2
+    names = [*"power phase delay aoa_az aoa_el aod_az aod_el inter inter_pos rx_pos tx_pos".split()]  # noqa: SIM905
+    held = {name: np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in names}
+    return json.loads((tmp_path / "params.json").read_text()), held
+
+
+def test_channels_of_the_scenario_are_the_models(scenario):
+    params, held = scenario
+    sends, receives = params["txrx_sets"].values()
+    assert sends["is_tx"] and receives["is_rx"] and receives["num_points"] == 2
+    assert params["scene"]["num_scenes"] == 1 and params["rt_params"]["frequency"] == CARRIER
+    shift = np.array([-5e6, 0, 7e6])
+    gain = 10 ** (held["power"] / 20) * np.exp(1j * np.radians(held["phase"]))
+    turned = np.exp(-2j * np.pi * shift * held["delay"][..., None]) * gain[..., None]
+    expected = Mirror().paths(PLACES).channel(CARRIER + shift)[:, 0] * (CARRIER + shift) / CARRIER
+    np.testing.assert_allclose(np.nansum(turned, 1), expected, rtol=2e-4)
+    assert np.isnan(held["power"][:, 2:]).all()  # a path without power is none
+
+
+def unit(azimuth, zenith):
+    azimuth, zenith = np.radians(azimuth), np.radians(zenith)
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
+
+
+def towards(start, end):
+    return (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+
+
+def test_places_in_utm_metres_were_rounded_to_half_a_metre(tmp_path, monkeypatch):
+    utm = np.array([447_000.25, 4_500_000.25, 0])
+    monkeypatch.setattr(Site, "origin", Site.origin + utm)
+    monkeypatch.setattr(Mirror, "paths", lambda self, rx, paths=Mirror.paths: paths(self, rx - utm))
+    deepmimo.write(tmp_path, Mirror(), PLACES + utm)
+    at, still, meets = (
+        np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in ("rx_pos", "tx_pos", "inter_pos")
+    )
+    np.testing.assert_allclose(at, PLACES + utm, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(still[0], STILL + utm, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(meets[:, 1, 0, 0], WALL + utm[0], rtol=0, atol=1e-3)
+
+
+def test_a_mirror_is_found_where_it_is(scenario):
+    _, held = scenario
+    np.testing.assert_array_equal(held["inter"][:, :2], [[0, 1], [0, 1]])
+    point = held["inter_pos"][:, 1, 0]
+    np.testing.assert_allclose(point[:, 0], WALL, atol=1e-3)
+    whole = np.linalg.norm(point - STILL, axis=1) + np.linalg.norm(point - PLACES, axis=1)
+    np.testing.assert_allclose(whole, held["delay"][:, 1] * LIGHT, rtol=1e-5)
+    leaves, arrives = (unit(held[f"{name}_az"], held[f"{name}_el"]) for name in ("aod", "aoa"))
+    for path, at in ((0, PLACES), (1, point)):
+        np.testing.assert_allclose(leaves[:, path], towards(STILL, at), atol=1e-4)
+    np.testing.assert_allclose(arrives[:, 1], towards(PLACES, point), atol=1e-4)
+
+
+def test_models_without_paths_are_refused(tmp_path):
+    class Waves(Mirror):
+        def paths(self, rx):
+            raise ValueError("paths: none")
+
+    with pytest.raises(ValueError, match="made of paths"):
+        deepmimo.write(tmp_path, Waves(), PLACES)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_package_of_that_name_reads_it(tmp_path, monkeypatch):
+    package = pytest.importorskip("deepmimo", reason="deepmimo 4 is not installed")
+    folder = tmp_path / "deepmimo_scenarios" / "mirror"
+    folder.mkdir(parents=True)
+    deepmimo.write(folder, Mirror(), PLACES)
+    monkeypatch.chdir(tmp_path)
+    how = package.ChannelParameters()
+    how.bs_antenna.shape = np.array([1, 1])
+    found = package.load("mirror").compute_channels(how)[:, 0, 0, 0] * how.ofdm.subcarriers**0.5
+    np.testing.assert_allclose(found, Mirror().paths(PLACES).gain[:, 0].sum(-1), rtol=1e-4)

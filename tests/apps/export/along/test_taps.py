@@ -1,0 +1,193 @@
+"""Taps of known channels, their Doppler, and the file that a link simulator plays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from scipy.interpolate import CubicSpline
+
+import gsparc
+from gsparc.apps.export.along.taps import Trajectory, fitted
+from gsparc.commands import export
+from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.data.schema import LIGHT
+from gsparc.models import checkpoint
+from gsparc.prediction.channels import Paths
+
+CARRIER = 3.5e9
+
+
+class Site:
+    kind, static_end, moving_end, name = "csi", "tx", "rx", "two rays"
+
+    def __init__(self, tones):
+        self._tones = tones
+
+    def tones(self):
+        return self._tones
+
+
+class Rays:
+    """A line of sight and a mirror image, of an array of three antennas; `paths` where it is asked to."""
+
+    sources = np.array([[0.0, 0, 5], [0, -40, 5], [-55.0, 0, 5]])
+
+    def __init__(self, tones, with_paths=False):
+        self.site, self.with_paths = Site(tones), with_paths
+
+    def csi(self, tx=None, rx=None):
+        return self._paths(rx).channel(self.site.tones())
+
+    def paths(self, rx):
+        if not self.with_paths:
+            raise ValueError("paths: channels are not made of paths")
+        return self._paths(rx)
+
+    def _paths(self, rx):
+        array = np.array([[0.0, 0, 0], [0.04, 0, 0], [0.08, 0, 0]])
+        middle = float(self.site.tones().mean())
+        away = np.linalg.norm(rx[:, None, None] - (self.sources + array[:, None])[None], axis=-1)
+        gain = (1e-3 / away * np.exp(-2j * np.pi * middle * away / LIGHT)).astype(np.complex64)
+        return Paths(gain, away / LIGHT, middle)
+
+
+def drive(speed=10.0, length=0.5):
+    start = np.array([30.0, 10, 1.5])
+    time_s = np.array([0.0, length])
+    return Trajectory(time_s, start + np.outer(time_s * speed, [1.0, 0, 0]))
+
+
+TONES = CARRIER + 240e3 * (np.arange(128) - 63.5)
+
+
+@pytest.mark.parametrize("with_paths", [False, True])
+def test_taps_sum_to_the_channel_at_any_time(with_paths):
+    model, way = Rays(TONES, with_paths), drive()
+    line = fitted(model, way, 48, 38.4e6, 3)
+    assert line.residual < 1e-3 and line.worst < 1e-2 and (line.paths is not None) == with_paths
+    between = np.linspace(0.003, 0.497, 37)  # not instants
+    tones = TONES[20:-20]
+    delay = (line.first + np.arange(48)) / line.rate_hz
+    taps = CubicSpline(line.time_s, line.gain)(between)  # as a reader of the file has it
+    summed = taps @ np.exp(-2j * np.pi * np.outer(delay, tones - line.carrier_hz))
+    true = model._paths(way.at(between)).channel(tones)
+    assert np.mean(np.abs(summed - true) ** 2) < 2e-3 * np.mean(np.abs(true) ** 2)
+
+
+def test_doppler_is_that_of_the_motion():
+    model, way = Rays(TONES, True), drive()
+    line = fitted(model, way, 16, 38.4e6)
+    middle = way.at(np.array([0.25]))[0]
+    towards = (model.sources - middle) / np.linalg.norm(model.sources - middle, axis=1)[:, None]
+    expected = CARRIER / LIGHT * 10 * towards[:, 0]
+    found = line.path_doppler_hz()[len(line.time_s) // 2, 0]
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+    loudest = np.abs(line.gain[:, 0]).mean(0).argmax()
+    assert line.doppler_hz()[0, loudest] == pytest.approx(expected[0], rel=0.15)
+
+
+def test_residual_is_stated_and_falls_with_taps():
+    found = [fitted(Rays(TONES), drive(length=0.1), taps).residual for taps in (1, 4, 8, 32)]
+    assert found[0] > found[1] > found[2] > found[3] and found[0] > 0.05
+
+
+@pytest.mark.parametrize("said, tones, length, rate_hz", [
+    ("each later than the one before", TONES, 0.0, None),
+    ("rate_hz= is needed", TONES[:1], 0.5, None),
+    ("the tones span", TONES, 0.5, 1e6),
+    ("wavelengths long", TONES, 1e4, None),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(said, tones, length, rate_hz):
+    with pytest.raises(ValueError, match=said):
+        fitted(Rays(tones), drive(length=length), 4, rate_hz)
+
+
+def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    tones = 30e6 + 1e5 * np.arange(8)  # few measurements know waves of ten metres
+    rx, ray = rng.uniform([25, 5, 1], [40, 15, 2], (40, 3)), Rays(tones)
+    csi = ray.csi(rx=rx)[:, 0]
+    model = gsparc.fit(rx=rx, tx=ray.sources[0], csi=csi, frequency_hz=tones, model="complex_gp")
+    checkpoint.save(tmp_path / "model.ckpt", model.method)
+    (tmp_path / "drive.csv").write_text("time_s,x,y,z\n0,30,10,1.5\n0.02,30.2,10,1.5\n")
+    monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
+
+    def run(*given):
+        return export.task(compose(*given, config="export"))
+
+    out, common = tmp_path / "out", (f"ckpt={tmp_path}/model.ckpt", "to=taps", f"table={tmp_path}/drive.csv")
+    facts = run(*common, f"out={out}", "taps=4")
+    assert facts["taps/residual_db"] < -1
+    held = read_raw(out / "taps.npz")
+    assert held.arrays["gain"].shape == (4, 1, 4) and held.arrays["delay_s"].shape == (4,)
+    (tmp_path / "still.csv").write_text("x,y,z\n30,10,1.5\n31,10,1.5\n")
+    with pytest.raises(ValueError, match="no column time_s"):
+        run(*common[:2], f"table={tmp_path}/still.csv", f"out={tmp_path}/other")
+    assert not (tmp_path / "other").exists()
+
+
+def played(file, line, taps, end="rx_position"):
+    """Sionna's channel model of a line of taps."""
+    from gsparc.apps.export.along.link import TrajectoryChannel
+
+    delay = (line.first + np.arange(taps)) / line.rate_hz
+    arrays = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay}
+    write_raw(file, Raw({**arrays, end: drive().at(line.time_s)}))
+    return TrajectoryChannel(file, seed=3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("receives", [False, True])
+def test_sionna_hears_the_models_channel(tmp_path, receives):
+    """Through Sionna's own way from a channel model to a grid of tones and symbols."""
+    pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
+    from sionna.phy.channel import cir_to_ofdm_channel
+
+    ray, way = Rays(TONES), drive()
+    end = "tx_position" if receives else "rx_position"
+    model = played(tmp_path / "cir.npz", fitted(ray, way, 64, antennas=2), 64, end)
+    gain, tau = model(5, 14, 28e3)
+    assert gain.shape == ((5, 1, 2, 1, 1, 64, 14) if receives else (5, 1, 1, 1, 2, 64, 14))
+    assert tau.shape == (5, 1, 1, 64)
+    middle = slice(20, -20)  # at the band's ends taps at whole samples fit worst
+    tones = torch.from_numpy((TONES - TONES.mean())[middle].astype(np.float32))
+    heard = cir_to_ofdm_channel(tones, gain, tau).numpy().reshape(5, 2, 14, -1)
+    begin = np.random.default_rng(3).uniform(0, 1, 5) * (0.5 - 13 / 28e3)
+    for one, start in zip(heard, begin, strict=True):
+        expected = ray.csi(rx=way.at(start + np.arange(14) / 28e3))[:, :2, middle].transpose(1, 0, 2)
+        assert np.mean(np.abs(one - expected) ** 2) < 1e-3 * np.mean(np.abs(expected) ** 2)
+    with pytest.raises(ValueError, match="from a trajectory of"):
+        model(1, 20, 10.0)
+
+
+@pytest.mark.slow
+def test_a_link_over_exported_taps_is_the_link_study(tmp_path):
+    """The same blocks in the same noise: over the model's channels, as `gsparc link`, and over its taps."""
+    sionna = pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
+    from sionna.phy.channel import cir_to_ofdm_channel
+
+    from gsparc.apps.link.adaptation import Band
+    from gsparc.apps.link.pusch import Pusch
+
+    tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
+    ray, way = Rays(tones, True), drive()
+    model = played(tmp_path / "cir.npz", fitted(ray, way, 32, 30.72e6), 32)
+    gain, tau = model(32, 1, 1.0)  # still while a slot lasts
+    offset = torch.from_numpy((tones - CARRIER).astype(np.float32))
+    exported = cir_to_ofdm_channel(offset, gain, tau).reshape(32, 48)
+    begin = np.random.default_rng(3).uniform(0, 1, 32) * 0.5
+    study = torch.from_numpy(ray.csi(rx=way.at(begin))[:, 0].astype(np.complex64))
+    assert (exported - study).abs().square().mean() < 1e-5 * study.abs().square().mean()
+    pusch = Pusch("qpsk", 4, 30, np.ones(48, complex), 8, ["perfect", "predicted"])
+    blocks = []
+    for heard in (study, exported):
+        torch.manual_seed(0)
+        sionna.config.seed = 0
+        band = Band(heard, study, torch.full((32,), 1e-3))
+        blocks.append(pusch.run(band, 3.0, np.arange(512) % 32, 128))
+    for name in ("perfect", "predicted"):
+        there, here = (one[one.receiver == name] for one in blocks)
+        assert 0.02 < there.failed.mean() < 0.98 and (there.failed != here.failed).mean() < 0.01
+        assert (there.wrong - here.wrong).abs().mean() < 1e-3

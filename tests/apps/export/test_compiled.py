@@ -1,0 +1,326 @@
+"""Fields exported for C answer as the model does, from any number of threads; what is damaged is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+import zlib
+from functools import partial
+from pathlib import Path
+
+import campaigns
+import field_files
+import numpy as np
+import pytest
+import torch
+
+import gsparc
+from gsparc.apps.export.compiled import make
+from gsparc.apps.export.compiled.blob import CHECKED, HEAD, Form, packed
+from gsparc.commands import export
+from gsparc.commands.train import train
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.query import Query
+from gsparc.models import checkpoint
+from gsparc.models.terms import EffectSettings
+from gsparc.processes import powers
+from gsparc.processes.neighbourhood import Neighbourhood
+
+ROOT = Path(__file__).parents[3]
+SOURCES, EXAMPLES = ROOT / "ops" / "csrc" / "field", ROOT / "examples" / "c-library"
+LIGHT, PLACES, SCALE = 299_792_458.0, int(os.environ.get("GSPARC_PLACES", "400")), 1e-5
+FUZZ_S = int(os.environ.get("GSPARC_FUZZ_S", "10"))
+
+
+def of_powers(count, model="gp", **settings):
+    """About a distance law, far from the world's origin."""
+    rng = np.random.default_rng(0)
+    tx, rx = np.array([103.0, 52.0, 2.5]), rng.uniform([100, 50, 0], [130, 75, 2], (count, 3))
+    far = np.linalg.norm(rx - tx, axis=1)
+    level = -40 - 22 * np.log10(far) + 3 * np.sin(rx[:, 0] - 100) + rng.normal(0, 1, count)
+    return gsparc.fit(rx=rx, tx=tx, rssi=level, model=model, settings=settings)
+
+
+def of_sources(tones, antennas=1, clutter=False):
+    """A line of sight and a wall."""
+    rng = np.random.default_rng(1)
+    tx, rx = np.array([4.0, 2.5, 2.2]), rng.uniform([0, 0, 0.5], [5, 4, 2], (40, 3))
+    frequency = 2.4e9 + 1e6 * np.arange(tones)
+    array = np.c_[0.05 * np.arange(antennas), np.zeros((antennas, 2))]
+    heard = rx[:, None] + array
+    far = np.stack([np.linalg.norm(heard - place, axis=-1) for place in (tx, tx * [-1, 1, 1])])[..., None]
+    csi = (np.exp(-2j * np.pi * frequency / LIGHT * far) / far).sum(0)
+    given = {} if antennas == 1 else {"array_position": array}
+    settings = {"searches": 1, "clutter": clutter, "search_rows": 80}
+    return gsparc.fit(
+        rx=rx, tx=tx, csi=csi, frequency_hz=frequency, model="image_source_gp", settings=settings,
+        budget_s=2, rx_rotation=np.eye(3), **given,
+    )  # fmt: skip
+
+
+def of_images(model, **settings):
+    """Of 18 x 36 pixels with two lobes."""
+    rng = np.random.default_rng(2)
+    rx, tx = np.array([2.0, 1.0, 1.0]), rng.uniform([0, 0, 0.5], [4, 3, 2], (40, 3))
+    column = np.arctan2(*(tx - rx)[:, 1::-1].T)[:, None, None] + np.pi
+    rows, columns = np.meshgrid(np.arange(18), np.arange(36) / 18 * np.pi, indexing="ij")
+    lobes = np.exp(4 * np.cos(columns - column) - 4 - (rows - 5) ** 2 / 20) * 0.8 + 0.1
+    return gsparc.fit(rx=rx, tx=tx, spectrum=lobes, model=model, settings=settings)
+
+
+def of_a_real_array(real, folder):
+    """The release's 160 spectra."""
+    settings = ("dataset=rfid", f"dataset.root={real}", "model=gsparc", "baselines=[]", "logger=none")
+    train(campaigns.compose(*settings), folder)
+    return gsparc.load(folder / "model.ckpt")
+
+
+def built(folder, *options):
+    for command in (
+        ["cmake", "-S", SOURCES, "-B", folder, "-DCMAKE_BUILD_TYPE=Release", *options],
+        ["cmake", "--build", folder],
+    ):
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
+    return folder / "libgsparc_field.so"
+
+
+def driver(library, *options):
+    out = library.with_name("driver")
+    source = ROOT / "tests" / "helpers" / "driver.cpp"
+    linked = ["-L", library.parent, "-lgsparc_field", f"-Wl,-rpath,{library.parent}"]
+    given = ["g++", "-O1", "-std=c++17", "-pthread", *options, source, "-I", SOURCES, *linked, "-o", out]
+    subprocess.run(given, check=True, capture_output=True, text=True, timeout=300)
+    return out
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory):
+    return built(tmp_path_factory.mktemp("library"))
+
+
+@pytest.fixture(scope="session")
+def example():
+    spec = importlib.util.spec_from_file_location("field", EXAMPLES / "field.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
+    predictor = of_powers(60)
+    found = make.compiled(predictor)
+    assert (found.form.kind, found.error) == (4, 0) and found.summary == "a process of powers, exactly"
+    blob = packed(found.form, predictor.site.origin, found.error)
+    magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
+    assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
+    assert checksum == zlib.crc32(blob[CHECKED:])
+
+
+def test_trees_hold_every_row_and_boxes_those_below():
+    places = np.random.default_rng(0).uniform(size=(5000, 3))
+    order, sets, boxes = make.powers_form.__globals__["_trees"](Neighbourhood.of(places, 0), 30)
+    assert sorted(order) == list(range(5000)) and sets[:, 1].sum() == 30 and len(sets) == 2
+    boxes, first = boxes.reshape(-1, 2, 3), 0
+    for count, _, depth in sets:
+        nodes, own = boxes[: (2 << depth) - 1], places[order[first : first + count]]
+        for leaf in range(1 << depth):
+            inside = own[count * leaf >> depth : count * (leaf + 1) >> depth]
+            node = leaf + (1 << depth) - 1
+            while True:
+                assert (nodes[node, 0] <= inside).all() and (inside <= nodes[node, 1]).all()
+                if node == 0:
+                    break
+                node = (node - 1) // 2
+        boxes, first = boxes[(2 << depth) - 1 :], first + count
+
+
+def test_channels_without_sources_and_stations_are_refused_in_one_line():
+    rng = np.random.default_rng(0)
+    rx, csi = rng.uniform(size=(20, 3)), rng.normal(size=20) + 1j
+    waves = gsparc.fit(rx=rx, tx=[3.0, 2, 1], csi=csi, frequency_hz=2.4e9, model="complex_gp")
+    with pytest.raises(ValueError, match=r"^complex_gp: channels that are not made of image sources [^\n]*$"):
+        make.compiled(waves)
+
+
+MODELS = {
+    "powers, all rows": partial(of_powers, 300),
+    "powers, variance of the nearest": partial(of_powers, 1500),
+    "powers, the nearest": partial(of_powers, 700),
+    "powers, a mean of processes": partial(of_powers, 120, "gsparc"),
+    "powers, distilled": partial(of_powers, 80, "idw"),
+    "sources": partial(of_sources, 1),
+    "sources, many tones": partial(of_sources, 40),
+    "sources, four antennas": partial(of_sources, 7, 4),
+    "image of a process": partial(of_images, "gp"),
+    "image of Gaussians": partial(of_images, "gsparc", effects=EffectSettings(residual=False)),
+    "image, distilled": partial(of_images, "idw"),
+    "array": None,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
+def test_the_library_answers_as_the_model(name, library, example, tmp_path, monkeypatch, request):
+    """At random places to 1e-5 of the scale, with variance and unknown share where these are exact."""
+    monkeypatch.setattr(powers, "MOST_ROWS", 500 if name == "powers, the nearest" else 6000)
+    torch.set_num_threads(1)
+    real = None if MODELS[name] else request.getfixturevalue("real_rfid")
+    predictor = MODELS[name]() if MODELS[name] else of_a_real_array(real, tmp_path)
+    site, found = predictor.site, make.compiled(predictor)
+    assert (found.error > 0) == ("distilled" in name), found.summary
+    path = tmp_path / "field.gsparc"
+    path.write_bytes(packed(found.form, np.asarray(site.origin), found.error))
+    field, places = example.Field(path, library), make.random_places(site, PLACES, 3)
+    answers = [field(place.astype(np.float64) + site.origin) for place in places]
+    own = np.stack([one[0] for one in answers])
+    expected = make.answers(found.form.predictor or predictor, places).reshape(own.shape)
+    assert field.facts.error == found.error
+    scale = np.sqrt(np.mean(np.abs(expected) ** 2))
+    assert np.abs(own - expected).max() < SCALE * scale
+    if site.kind == "rssi" and not found.error:
+        rx = torch.from_numpy(places)
+        tx = torch.tensor(site.static_position).float().expand(len(rx), 3)
+        said = predictor.method.predict(Query(tx, gsparc.ops.Pose.identity(rx)))
+        variance, unknown = (np.array(part) for part in list(zip(*answers, strict=True))[1:])
+        np.testing.assert_allclose(variance, said.variance * site.target_scale**2, rtol=1e-4)
+        np.testing.assert_allclose(unknown, said.unknown, atol=1e-5)
+    else:
+        assert np.isnan([one[1] for one in answers]).all()
+    field.close()
+
+
+def damaged(blob, draw):
+    """One to four bytes otherwise, or an end cut off."""
+    found = bytearray(blob)
+    for at in draw.integers(0, len(blob) if draw.random() < 0.5 else 600, draw.integers(1, 5)):
+        found[at] ^= int(draw.integers(1, 256))
+    return bytes(found[: draw.integers(len(found))] if draw.random() < 0.2 else found)
+
+
+def files(folder, count, make_one, seed=0):
+    """Of `make_one(draw)`."""
+    draw, names = np.random.default_rng(seed), [folder / f"{number}" for number in range(count)]
+    for name in names:
+        name.write_bytes(make_one(draw))
+    return names
+
+
+@pytest.mark.slow
+def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_path):
+    predictor = of_powers(100)
+    blob = packed(make.compiled(predictor).form, predictor.site.origin, 0.0)
+    path = tmp_path / "field.gsparc"
+    path.write_bytes(blob)
+    run = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=300)
+    asked = driver(library)
+    said = run([asked, path, "8", "10000000"]).stdout  # of a tenth two threads' collision was often missed
+    assert said.split() == ["queries", "10000000", "wrong", "0", "allocations", "0"]
+    cut = files(tmp_path, 1000, partial(damaged, blob))
+    assert run([asked, *cut]).stdout.split() == ["refused", "1000"]
+
+
+@pytest.mark.slow
+def test_sizes_whose_product_left_32_bits_were_written_beyond(library, example, tmp_path):
+    """65,536 x 65,536 entries: none in 32 bits: no factors were needed, and answers had no room."""
+    sizes = [1, 1, 65536, 65536, 1, 1]
+    arrays = {
+        name: np.ones(count) for name, count in field_files.needed(3, sizes).items() if name != "factors"
+    }
+    double = ("moving", "sources", "images", "combs", "offsets")
+    arrays = {name: value.astype("f8" if name in double else "f4") for name, value in arrays.items()}
+    form = Form(3, [*map(float, sizes), 1e9], arrays | {"middle": np.zeros(3)})
+    (path := tmp_path / "field.gsparc").write_bytes(packed(form, np.zeros(3)))
+    with pytest.raises(ValueError, match="factors is missing"):
+        example.Field(path, library)
+    arrays = arrays | {"middle": np.zeros(3), "factors": np.ones(2 << 20, "f4")}
+    sizes = [1, 1, 1, 1 << 20, 1, 1]
+    fits = {name: np.resize(arrays[name], count) for name, count in field_files.needed(3, sizes).items()}
+    fits |= {"middle": np.zeros(3), "combs": np.array([1e9, 1e6, 1e5])}
+    path.write_bytes(packed(Form(3, [*map(float, sizes), 1e9], fits), np.zeros(3)))
+    with pytest.raises(ValueError, match="an answer of 209715200000 numbers"):
+        example.Field(path, library)
+
+
+@pytest.mark.slow
+def test_places_that_python_refuses_were_answered_by_the_library(library, example, tmp_path):
+    predictor = of_powers(60)
+    path = tmp_path / "field.gsparc"
+    path.write_bytes(packed(make.compiled(predictor).form, predictor.site.origin))
+    field = example.Field(path, library)
+    for place in ([FARTHEST * 1.01, 0, 0], [0, 0, -2 * FARTHEST], [0, np.nan, 0]):
+        with pytest.raises(ValueError, match="status 1"):
+            field(np.array(place))
+        with pytest.raises(ValueError, match=r"^rx= holds"):
+            predictor.rssi(rx=place)
+    field(np.array([FARTHEST * 0.99, 0, 0]))
+    field.close()
+
+
+def test_the_stated_error_missed_the_metres_under_a_station():
+    """Of 256 draws over 400 x 400 m none was there; and it was linear, which a few strong places decide."""
+    rng, tx = np.random.default_rng(0), np.array([200.0, 200, 3])
+    rx = rng.uniform([0, 0, 0], [400, 400, 2], (300, 3))
+    level = -40 - 20 * np.log10(np.linalg.norm(rx - tx, axis=1))
+    predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
+    found = make.compiled(predictor, 1024)
+    assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
+    places = make.random_places(predictor.site, 20_000, 9)
+    own, whole = (make.answers(one, places)[:, 0] for one in (found.form.predictor, predictor))
+    apart = 10 * np.log10(own / whole)
+    assert found.error == pytest.approx(np.sqrt(np.mean(apart**2)), rel=0.1)
+    assert found.worst > 0.7 * np.abs(apart).max()
+    near = make.near_places(predictor.site, 400, 1) - predictor.site.static_position
+    assert np.median(np.linalg.norm(near[:, :2], axis=1)) < 10
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900 + FUZZ_S)
+@pytest.mark.parametrize("portable", ["OFF", "ON"])
+def test_sanitizers_see_nothing(tmp_path, portable, capsys):
+    """Sound files, and those with several fields changed whose checksums are right: refused, or answered from
+    within. `GSPARC_FUZZ_S=3600`: for an hour."""
+    library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON", f"-DGSPARC_PORTABLE={portable}")
+    asked = driver(library, "-fsanitize=address,undefined", "-DGSPARC_WATCHED")
+    models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4), of_images("gp"))
+    forms = [field_files.an_array(), *(make.compiled(predictor, 64).form for predictor in models)]
+    until, seed, slow, refused = time.monotonic() + FUZZ_S, 0, 0, 0
+    while seed < 2 or time.monotonic() < until:
+        for number, form in enumerate(forms):
+            (sound := tmp_path / "sound").write_bytes(packed(form, np.zeros(3)))
+            given = [sound, *files(tmp_path, 100, partial(field_files.mutated, form), (seed, number))]
+            found = subprocess.run([asked, *given], capture_output=True, text=True, timeout=300)
+            slow += found.returncode == -signal.SIGALRM
+            assert found.returncode in (0, -signal.SIGALRM), (seed, number, found.stderr[-2000:])
+            if not found.returncode:
+                refused += int(found.stdout.split()[1])
+                assert int(found.stdout.split()[1]) < len(given)  # the sound one was answered
+        seed += 1
+    with capsys.disabled():
+        sys.stderr.write(f"{seed * len(forms) * 100} files, {refused} refused, {slow} slow\n")
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, monkeypatch):
+    predictor, path, out = of_powers(60), tmp_path / "model.ckpt", tmp_path / "out"
+    checkpoint.save(path, predictor.method)
+    monkeypatch.setattr(export, "run_directory", lambda: tmp_path)
+    config = campaigns.compose(f"ckpt={path}", f"out={out}", config="export")
+    facts = export.task(config)
+    assert facts["export/error"] == 0 and (out / "field.gsparc").stat().st_size == facts["export/bytes"]
+    with pytest.raises(ValueError, match="is there already"):
+        export.task(config)
+    for command in (
+        ["cmake", "-S", out / "source" / "field", "-B", out / "build", "-DGSPARC_PORTABLE=ON"],
+        ["cmake", "--build", out / "build"],
+        ["cc", EXAMPLES / "query.c", "-I", out, "-L", out / "build", "-lgsparc_field",
+         f"-Wl,-rpath,{out / 'build'}", "-lm", "-o", tmp_path / "query"],
+    ):  # fmt: skip
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+    query = [tmp_path / "query", out / "field.gsparc", "110", "60", "1"]
+    said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
+    expected = float(predictor.rssi(rx=[110.0, 60, 1], unit="linear")[0])
+    assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)

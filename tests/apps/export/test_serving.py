@@ -1,0 +1,435 @@
+"""Answers over HTTP: many clients, malformed requests, clients that die, a stop after what is under way."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import logging
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gsparc
+from gsparc.commands.serve import loopback
+from gsparc.models import checkpoint
+
+pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
+pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
+from gsparc.apps.export.serving import RAW, Limits, Server, application
+
+TX = np.array([3.0, 2, 2])
+HOSTILE, HOSTILE_S = (
+    Path(__file__).parents[2] / "helpers" / "hostile.py",
+    int(os.environ.get("GSPARC_HOSTILE_S", "15")),
+)
+
+
+def fitted(kind="rssi"):
+    rng = np.random.default_rng(0)
+    rx = rng.uniform([0, 0, 0], [20, 20, 2], (60, 3))
+    far = np.linalg.norm(rx - TX, axis=1)
+    if kind == "rssi":
+        return gsparc.fit(rx=rx, tx=TX, rssi=-40 - 20 * np.log10(far), model="gp")
+    csi = (np.exp(-2j * np.pi * 30e6 / 3e8 * far) / far)[:, None, None]
+    return gsparc.fit(rx=rx, tx=TX, csi=csi, frequency_hz=30e6, model="complex_gp")
+
+
+class Served:
+    def __init__(self, predictor, token=None, **limits):
+        limits = Limits(**{"most": 64, **limits})
+        app = application(predictor, limits, token)
+        self.server = Server(app, limits, port=0)
+        self.thread = threading.Thread(target=self.server.run, daemon=True)
+
+    def __enter__(self):
+        self.thread.start()
+        until = time.monotonic() + 20
+        while not self.server.started and time.monotonic() < until:
+            time.sleep(0.01)
+        self.port = self.server.servers[0].sockets[0].getsockname()[1]
+        return self
+
+    def __exit__(self, *_):
+        self.server.should_exit = True
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+
+    @property
+    def connections(self):
+        return len(self.server.server_state.connections)
+
+    def post(self, body, kind="application/json", **headers):
+        client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        client.request("POST", "/predict", body, {"content-type": kind, **headers})
+        answer = client.getresponse()
+        found = answer.status, answer.read(), dict(answer.getheaders())
+        client.close()
+        return found
+
+    def get(self, path, **headers):
+        client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        client.request("GET", path, headers=headers)
+        with contextlib.closing(client):
+            return client.getresponse().status
+
+    def send(self, sent):
+        client = socket.create_connection(("127.0.0.1", self.port), timeout=20)
+        client.sendall(sent)
+        return client
+
+    def within(self, seconds, ready):
+        until = time.monotonic() + seconds
+        while not ready() and time.monotonic() < until:
+            time.sleep(0.02)
+        return ready()
+
+
+def as_json(places):
+    return json.dumps({"places": np.asarray(places).tolist()})
+
+
+@pytest.fixture(scope="module")
+def powers():
+    return fitted()
+
+
+@pytest.fixture(scope="module")
+def served(powers):
+    with Served(powers) as running:
+        yield running
+
+
+def test_json_and_raw_bodies_hold_what_the_model_answers(powers, served):
+    places = np.random.default_rng(1).uniform(0, 10, (7, 3)).astype(np.float32)
+    expected = powers.rssi(rx=places.astype(np.float64))
+    status, body, _ = served.post(as_json(places))
+    assert status == 200 and json.loads(body)["shape"] == [7, 1]
+    np.testing.assert_allclose(json.loads(body)["values"], expected, rtol=1e-5)
+    status, body, headers = served.post(places.tobytes(), RAW)
+    assert status == 200 and headers["x-shape"] == "7,1"
+    np.testing.assert_allclose(np.frombuffer(body, "<f4"), expected[:, 0], rtol=1e-5)
+    client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+    client.request("GET", "/healthz")
+    assert json.loads(client.getresponse().read()) == {
+        "status": "ok", "kind": "rssi", "model": "gp", "end": "rx", "unit": "dBm"
+    }  # fmt: skip
+
+
+def test_a_media_type_in_capitals_was_taken_for_json(served):
+    assert served.post(np.ones((1, 3), "<f4").tobytes(), RAW.title())[0] == 200
+
+
+def test_deviations_and_all_stations_in_the_unit_asked_for(powers, served):
+    """Of several stations none was served but by name, and no deviation at all."""
+    client = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+    client.request("POST", "/std", as_json([[5, 5, 1]]))
+    said = json.loads(client.getresponse().read())
+    assert said["unit"] == "dBm" and said["values"] == powers.std(rx=[[5.0, 5, 1]]).tolist()
+    level = -40 - np.arange(60)[:, None] / 9 - [0, 10]
+    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
+    masts = [[0, 0, 9], [9, 9, 9]]
+    several = gsparc.fit(rx=places, station_position=masts, rssi=level, unit="dBW", model="gp")
+    with Served(gsparc.Predictor(several.method, several.site, unit="mW")) as running:
+        status, body, _ = running.post(as_json(places[:3]))
+        _, raw, headers = running.post(places[:3].astype("<f4").tobytes(), RAW)
+    said, wanted = json.loads(body), several.rssi(rx=places[:3], unit="mW")
+    assert status == 200 and headers["x-unit"] == said["unit"] == "mW" and said["shape"] == [3, 2]
+    np.testing.assert_allclose(said["values"], wanted, rtol=1e-5)
+    np.testing.assert_allclose(np.frombuffer(raw, "<f4"), wanted.ravel(), rtol=1e-4)
+
+
+def test_the_level_of_silence_is_null(monkeypatch):
+    """JSON has no infinity: the answer was an error of the server."""
+    silent = gsparc.fit(rx=np.eye(3), tx=TX, rssi=[-40, -50, -60], model="zero")
+    with Served(silent) as running:
+        status, body, _ = running.post(as_json([[5, 5, 1], [4, 4, 1]]))
+    assert status == 200 and json.loads(body)["values"] == [[None], [None]]
+
+
+def test_channels_are_pairs():
+    predictor = fitted("csi")
+    with Served(predictor) as served:
+        _, body, headers = served.post(np.array([[5, 5, 1]], "<f4").tobytes(), RAW)
+    expected = predictor.csi(rx=[[5.0, 5, 1]])
+    assert headers["x-shape"] == "1,1,1,2"
+    np.testing.assert_allclose(
+        np.frombuffer(body, "<f4"), [expected.real.item(), expected.imag.item()], rtol=1e-4
+    )
+
+
+def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch):
+    rng = np.random.default_rng(2)
+    given = [rng.uniform(0, 10, (1 + i % 3, 3)) for i in range(32 * 8)]
+    expected = [powers.rssi(rx=places) for places in given]
+    calls = []
+    own = powers.rssi
+    with Served(powers) as served, ThreadPoolExecutor(32) as clients:
+        monkeypatch.setattr(powers, "rssi", lambda rx: calls.append(len(rx)) or own(rx=rx))
+        found = list(clients.map(lambda places: served.post(as_json(places)), given))
+    for (status, body, _), wanted in zip(found, expected, strict=True):
+        assert status == 200
+        np.testing.assert_allclose(json.loads(body)["values"], wanted, rtol=1e-5)
+    assert sum(calls) == sum(map(len, given)) and len(calls) < len(given)
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        ("", "application/json", 422),
+        ("{", "application/json", 422),
+        ("[1, 2]", "application/json", 422),
+        ('{"places": "here"}', "application/json", 422),
+        ('{"places": [[1, 2]]}', "application/json", 422),
+        ('{"places": [[1, 2], [3, 4, 5]]}', "application/json", 422),
+        ('{"places": [[1, 2, NaN]]}', "application/json", 422),
+        ('{"places": []}', "application/json", 422),
+        (b"\xff\xfe", "application/json", 422),
+        ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
+        ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
+        ('{"places": [[1, 2, true]]}', "application/json", 422),
+        ('{"places": [[1, 2, "3"]]}', "application/json", 422),
+        ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
+        ('{"places": ' + "[" * 60, "application/json", 422),
+        ('{"places": ' + "[" * 9000, "application/json", 413),
+        (b"12345", RAW, 422),
+        (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
+        (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
+        (b"0" * 100_000, RAW, 413),
+    ],
+)
+def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, kind, status):
+    found = served.post(body, kind)
+    assert found[0] == status and "\n" not in json.loads(found[1])["detail"]
+    assert served.post(as_json([[1, 2, 1]]))[0] == 200
+
+
+def test_one_bad_request_of_a_batch_spoils_no_other(powers):
+    with Served(powers, delay_ms=300) as served, ThreadPoolExecutor(2) as clients:
+        good = clients.submit(served.post, as_json([[1, 2, 1]]))
+        bad = clients.submit(served.post, as_json([[1, 2, 1e300]]))
+        assert (good.result()[0], bad.result()[0]) == (200, 422)
+
+
+def test_a_client_that_dies_is_no_matter(powers, caplog):
+    with Served(powers) as served:
+        for sent in (
+            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 500\r\n\r\n{",
+            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 25\r\n\r\n" + b'{"places": [[1, 2, 1.5]]}',
+            b"nonsense\r\n\r\n",
+        ):
+            for _ in range(8):
+                with socket.create_connection(("127.0.0.1", served.port)) as client:
+                    client.sendall(sent)
+        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
+def test_a_token_is_asked_for(powers):
+    with Served(powers, token="secret") as served:
+        for path in ("/docs", "/openapi.json", "/nowhere"):
+            assert served.get(path) == 401 and served.get(path, authorization="Bearer secret") in (200, 404)
+        assert served.get("/healthz") == 200
+        assert served.post(as_json([[1, 2, 1]]))[0] == 401
+        assert served.post(as_json([[1, 2, 1]]), authorization="Bearer wrong")[0] == 401
+        assert served.post(as_json([[1, 2, 1]]), authorization="Bearer secret")[0] == 200
+
+
+def test_raw_places_in_utm_metres_were_rounded_to_half_a_metre():
+    north = np.array([447_000.0, 4_500_000, 0])
+    rx = np.random.default_rng(0).uniform([0, 0, 0], [20, 20, 2], (40, 3))
+    level = -40 - 20 * np.log10(np.linalg.norm(rx - TX, axis=1))
+    utm = gsparc.fit(rx=rx + north, tx=TX + north, rssi=level, model="gp")
+    with Served(utm) as served:
+        status, body, _ = served.post((rx[:2] + north).astype("<f4").tobytes(), RAW)
+        assert status == 422 and "float32, which moves in steps of 0.5 m" in json.loads(body)["detail"]
+        assert served.post(as_json(rx[:2] + north))[0] == 200
+
+
+@pytest.fixture(scope="module")
+def spectra():
+    rng = np.random.default_rng(3)
+    given = {"rx": np.array([2.0, 1, 1]), "tx": rng.uniform(0, 4, (20, 3)), "model": "gp"}
+    return gsparc.fit(spectrum=rng.uniform(0, 1, (20, 18, 36)), **given)
+
+
+def test_numbers_of_an_answer_are_limited_and_large_ones_come_in_pieces(spectra):
+    places = np.random.default_rng(1).uniform(0, 4, (31, 3)).astype(np.float32)
+    with Served(spectra, numbers=20_000) as served:
+        status, body, _ = served.post(as_json(places))
+        assert status == 413 and json.loads(body)["detail"] == "at most 30 places, 648 numbers each"
+        expected = spectra.spectrum(tx=places[:30].astype(np.float64))
+        found = json.loads(served.post(as_json(places[:30]))[1])
+        assert found["shape"] == [30, 18, 36]
+        np.testing.assert_allclose(found["values"], expected, rtol=1e-4, atol=1e-6)
+        raw = np.frombuffer(served.post(places[:30].tobytes(), RAW)[1], "<f4")
+        np.testing.assert_allclose(raw.reshape(30, 18, 36), expected, rtol=1e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="numbers=600: an answer at one place holds 648"):
+        application(spectra, Limits(numbers=600), None)
+
+
+def test_few_places_do_not_wait_for_many(powers, monkeypatch):
+    sizes, own = [], powers.rssi
+    with Served(powers, most=40) as served, ThreadPoolExecutor(12) as clients:
+
+        def slow(rx):
+            sizes.append(len(rx))
+            time.sleep(0.2)
+            return own(rx=rx)
+
+        monkeypatch.setattr(powers, "rssi", slow)
+        large = [clients.submit(served.post, as_json(np.ones((40, 3)))) for _ in range(8)]
+        assert served.within(5, lambda: len(sizes) > 0)
+        started = time.monotonic()
+        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+        assert time.monotonic() - started < 1  # two of eight batches
+        assert {one.result()[0] for one in large} == {200}
+
+
+HALF = b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 500\r\n\r\n{"
+
+
+def test_half_sent_requests_took_all_files(powers):
+    with Served(powers, connections=8) as served:
+        clients = [served.send(HALF[: 10 + i]) for i in range(60)]
+        assert served.post(as_json([[1, 2, 1]]))[0] == 200
+        assert served.connections <= 8
+        for client in clients:
+            client.close()
+
+
+def test_heads_and_bodies_that_do_not_come_are_not_waited_for(powers):
+    with Served(powers, request_s=0.5) as served:
+        clients = [served.send(sent) for sent in (b"", HALF[:20], HALF)]
+        slow = served.send(HALF)
+        assert served.within(5, lambda: served.connections == 4)
+        for _ in range(20):  # a byte now and then buys no time
+            time.sleep(0.05)
+            with contextlib.suppress(OSError):
+                slow.sendall(b" ")
+        assert served.connections == 0
+        for client in (*clients, slow):
+            client.close()
+
+
+def test_clients_that_do_not_read_are_ended(spectra):
+    with Served(spectra, request_s=1, most=1500, numbers=1_000_000) as served:
+        body = as_json(np.ones((1500, 3))).encode()  # an answer of 19 MB
+        head = f"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: {len(body)}\r\n\r\n"
+        client = served.send(head.encode() + body)
+        assert served.within(5, lambda: served.connections == 1)
+        assert served.within(10, lambda: served.connections == 0)
+        client.close()
+
+
+def test_the_log_stays_open_while_there_are_files(powers, tmp_path):
+    """The server closed it, and opened it again to say that there are no files."""
+    log = logging.FileHandler(tmp_path / "log")
+    logging.getLogger().addHandler(log)
+    try:
+        with Served(powers):
+            assert log.stream is not None
+    finally:
+        logging.getLogger().removeHandler(log)
+        log.close()
+
+
+def test_others_reach_what_is_no_loopback():
+    assert [loopback(host) for host in ("::1", "localhost", "0.0.0.0", "example.org")] == [1, 1, 0, 0]
+
+
+@contextlib.contextmanager
+def commanded(folder, predictor, *settings, files=None):
+    """The command in a process of its own that may open so many files, and its port."""
+    checkpoint.save(folder / "model.ckpt", predictor.method)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    line = [sys.executable, "-m", "gsparc", "serve", f"ckpt={folder}/model.ckpt", f"port={port}", *settings]
+    allow = files and partial(resource.setrlimit, resource.RLIMIT_NOFILE, (files, files))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    served = subprocess.Popen(line, cwd=folder, env=environment, preexec_fn=allow)
+    try:
+        until = time.monotonic() + 60
+        while time.monotonic() < until and served.poll() is None:
+            with contextlib.suppress(OSError):
+                socket.create_connection(("127.0.0.1", port)).close()
+                break
+            time.sleep(0.2)
+        yield served, port
+    finally:
+        served.kill()
+        served.wait()
+
+
+def asked(port, places):
+    client = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    client.request("POST", "/predict", as_json(places), {"content-type": "application/json"})
+    with contextlib.closing(client):
+        answer = client.getresponse()
+        return answer.status, json.loads(answer.read())
+
+
+@pytest.mark.slow
+def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
+    with commanded(tmp_path, powers, "delay_ms=1000") as (served, port), ThreadPoolExecutor(1) as clients:
+        answer = clients.submit(asked, port, [[1, 2, 1]])
+        time.sleep(0.5)
+        served.send_signal(signal.SIGTERM)  # while the request waits for others
+        assert answer.result()[0] == 200
+        assert served.wait(20) in (0, -signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_75_half_sent_requests_ended_the_process(powers, tmp_path):
+    with commanded(tmp_path, powers, files=90) as (served, _):
+        assert served.wait(20) == 1  # 64 connections need more files, which is said
+    with commanded(tmp_path, powers, "connections=12", files=90) as (served, port):
+        clients = [socket.create_connection(("127.0.0.1", port)) for _ in range(75)]
+        for client in clients:
+            client.sendall(HALF)
+        assert asked(port, [[1, 2, 1]])[0] == 200 and served.poll() is None
+        for client in clients:
+            client.close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200 + HOSTILE_S)
+@pytest.mark.parametrize("kind", ["powers", "spectra"])
+def test_an_honest_client_is_answered_among_hostile_ones(kind, tmp_path, request, capsys):
+    """`GSPARC_HOSTILE_S=60`: for a minute."""
+    predictor = request.getfixturevalue(kind)
+    ask = partial(getattr(predictor, predictor.site.kind))
+    attack, late, memory = [sys.executable, str(HOSTILE)], [], []
+    with commanded(tmp_path, predictor) as (served, port):
+        assert asked(port, [[1, 2, 1]])[0] == 200
+        hostile = subprocess.Popen([*attack, str(port), str(HOSTILE_S), "1024" if kind == "powers" else "4"])
+        draw, started = np.random.default_rng(0), time.monotonic()
+        while hostile.poll() is None:
+            place = draw.uniform(0, 4, (1, 3))
+            before = time.monotonic()
+            status, answer = asked(port, place)
+            late.append(time.monotonic() - before)
+            assert status == 200
+            expected = ask(**{predictor.site.moving_end: place})
+            np.testing.assert_allclose(answer["values"], expected, rtol=1e-4, atol=1e-6)
+            pages = int(Path(f"/proc/{served.pid}/statm").read_text().split()[1])
+            memory.append((time.monotonic() - started, pages * resource.getpagesize() / 1e6))
+            time.sleep(0.05)
+    after = [mb for when, mb in memory if when > min(10, HOSTILE_S / 2)]
+    with capsys.disabled():
+        times = f"{np.median(late):.3f}, {np.quantile(late, 0.99):.3f}, {max(late):.3f} s"
+        mb = f"{after[0]:.0f} MB, then {min(after):.0f} to {max(after):.0f}"
+        sys.stderr.write(f"{len(late)} answers, median, p99, last {times}; {mb}\n")
+    assert hostile.returncode == 0 and max(late) < 1 and max(after) - after[0] < 20

@@ -1,0 +1,278 @@
+"""Grids, beams, statistics and the export; with Sionna itself in the slow part."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from cities import city, fold
+from doors import knock
+
+from gsparc import load
+from gsparc.apps.link.adaptation import Adaptation, Band, Rates
+from gsparc.apps.link.channels import truth
+from gsparc.apps.link.pusch import Pusch, frequency_correlation
+from gsparc.apps.link.study import beam_facts, crossing, gain, loss_db, rate_facts, transmit
+from gsparc.commands.listing import COMMANDS
+from gsparc.models import checkpoint
+from gsparc.models.uplink.method import UplinkField
+from gsparc.models.uplink.search import SearchSettings
+from gsparc.prediction.channels import centred, interpolated, resource_grid
+from gsparc.prediction.risk import binomial_interval
+from gsparc.training.context import FitContext
+
+needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
+
+
+@pytest.fixture(autouse=True)
+def _noise_repeats():
+    """Sionna draws bits and noise from a generator of its own."""
+    if find_spec("sionna") is not None:
+        from sionna.phy import config
+
+        config.seed = 0
+
+
+def drawn():
+    """`draw(*shape)`: complex normal numbers, the same in every test."""
+    return partial(torch.randn, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    data = city("all")
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), FitContext())
+    file = tmp_path_factory.mktemp("link") / "model.ckpt"
+    checkpoint.save(file, method)
+    return data, file
+
+
+def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
+    tones = 2.4e9 + 312.5e3 * np.arange(26)
+    delays = np.array([0, 80e-9, 210e-9, 700e-9])
+    gains = np.array([1, 0.6j, -0.4, 0.1 + 0.1j])
+
+    def response(frequency):
+        turns = np.outer(delays, frequency - 2.4e9)
+        return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[None, None]
+
+    wanted = centred(float(tones.mean()), 30e3, 240)
+    miss = interpolated(response(tones), tones, wanted) - response(wanted)
+    assert miss.abs().square().mean() < 1e-3 * response(wanted).abs().square().mean()
+    with pytest.raises(ValueError, match="fewer blocks"):
+        interpolated(response(tones), tones, centred(float(tones.mean()), 30e3, 2400))
+
+
+def test_one_tone_is_flat() -> None:
+    assert torch.equal(
+        interpolated(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
+    )
+
+
+def test_grid_is_sionna_s_order() -> None:
+    channel = torch.arange(12.0).reshape(2, 3, 2)
+    down = resource_grid(channel, 14, "rx")
+    assert down.shape == (2, 1, 1, 3, 14, 2) and torch.equal(down[1, 0, 0, 2, 5], channel[1, 2])
+    up = resource_grid(channel, 14, "tx")
+    assert up.shape == (1, 3, 2, 1, 14, 2) and torch.equal(up[0, 2, 1, 0, 5], channel[1, 2])
+
+
+def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
+    draw = drawn()
+    true = draw(200, 16, 4)
+    assert torch.allclose(gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
+    assert loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
+    noise = draw(200, 16, 4)
+    # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
+    assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
+
+
+def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
+    """A prediction of exactly 0, or one silent test channel, ended the command: -inf is no figure."""
+    true = drawn()(4, 2, 3)
+    silent = true.clone()
+    silent[1] = 0
+    nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
+    assert nothing["beams/2/loss_db"] == pytest.approx(100) == nothing["beams/2/loss_db_mean"]
+    some = beam_facts(silent, silent, np.array([False, True, False, False]))
+    assert some["beams/silent"] == 1 and some["beams/2/loss_db_max"] == pytest.approx(0, abs=1e-5)
+    assert some["beams/2/loss_db_accepted"] is None
+    assert beam_facts(0 * true, true, np.ones(4, bool)) == {"beams/positions": 4, "beams/silent": 4}
+    for facts in (nothing, some):
+        assert all(value is None or np.isfinite(value) for value in facts.values())
+
+
+def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
+    """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
+    none = np.zeros(2)
+    rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
+    facts = rate_facts({"expected": [rates]}, np.array([True, False]), np.array([0.2, 0.4]))
+    assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
+    assert all(value is None or np.isfinite(value) for value in facts.values())
+
+
+def test_crossing_and_intervals() -> None:
+    assert np.isclose(crossing(pd.Series([1.0, 0.1, 0.01])), 1.0)
+    assert crossing(pd.Series([1.0, 0.5, 0.2])) is None
+    low, high = binomial_interval(10, 100)
+    assert (
+        low < 0.1 < high
+        and binomial_interval(0, 10)[0] == 0
+        and binomial_interval(10, 10)[1] == 1
+        and binomial_interval(0, 0) == (0, 1)
+    )
+
+
+def test_truth_of_the_streets_is_in_the_snapshot_s_own_frame() -> None:
+    """Recomputed rays, turned by offsets found on the uplink, equal the measured downlink up to its noise."""
+    data = city("all")
+    rows = fold().test
+    exact, source = truth(data, rows, data.site.subcarriers_hz)
+    miss = (exact - data.targets(rows)).abs().square().mean((1, 2))
+    power = exact.abs().square().mean((1, 2))
+    # Noise, and the tones a frequency offset leaks into one another.
+    assert source == "rays" and (miss < 1.2 * float(data.noise_variance[0]) + 1e-3 * power).all()
+
+
+def test_export_on_any_grid(trained) -> None:
+    data, file = trained
+    predictor = load(file)
+    rows = fold().test[:2]
+    heard = data.uplink[rows] * data.site.target_scale
+    wanted = centred(float(data.site.subcarriers_hz.mean()), 30e3, 48)
+    slot = predictor.csi(uplink=heard, frequency_hz=wanted, symbols=14)
+    assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
+    tones = predictor.csi(uplink=heard)
+    assert tones.shape == (2, 64, 26)
+    exact, _ = truth(data, rows, wanted)
+    miss = np.abs(slot[:, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
+    assert miss.mean() < 0.3 * np.mean(np.abs(exact.numpy() * data.site.target_scale) ** 2)
+    found = predictor.paths(heard)
+    assert found.gain.shape == found.delay_s.shape == (2, 16) and found.cosines.shape == (2, 16, 2)
+    assert np.abs(found.delay_s).max() < 1 / 312.5e3
+    with pytest.raises(ValueError, match=r"expected \(B, 64, 26\)"):
+        predictor.csi(uplink=heard[:, :8])
+
+
+def test_a_coarse_look_may_be_all_there_is() -> None:
+    """coarse = fine once asked for a second part of no blocks."""
+
+    class Half:
+        def run(self, band, level, order, batch):
+            assert len(order)
+            failed = np.arange(len(order)) % 2 == 0
+            own = {"ebno_db": level, "position": order, "failed": failed, "wrong": failed * 0.1}
+            return pd.concat([pd.DataFrame(own | {"receiver": name}) for name in ("perfect", "predicted")])
+
+    nothing = Band(*[torch.zeros(5, 1)] * 3)
+    for fine, blocks in ((8, 8), (20, 20)):
+        found = transmit(Half(), nothing, [1.0], (8, fine, 4), lambda now: None)
+        assert len(found) == 2 * blocks
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
+    draw = drawn()
+    true = draw(40, 26)
+    known = Band(true, true, torch.zeros(40))
+    loop = Adaptation()
+    found = loop.rates(known, 0.03)
+    assert np.array_equal(found.oracle, found.chosen) and found.oracle_bps.mean() > 5e6
+    assert np.allclose(loop.rates(known, 0.03, 1.0, "expected").chosen_bps, found.best_bps)
+    assert (found.best_bps >= found.oracle_bps).all()
+    careful = loop.rates(known, 0.03, 3.0)
+    assert (careful.chosen <= found.oracle).all() and (careful.chosen < found.oracle).mean() > 0.5
+    deaf = loop.rates(known, 1e4)
+    assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
+    draw = drawn()
+    true = draw(200, 1).expand(200, 26)
+    error = draw(200, 1).expand(200, 26) * 0.2
+    band = Band(true, true + error, torch.full((200,), 0.04))
+    loop = Adaptation()
+    bold, careful = (loop.rates(band, 0.01, care, "expected") for care in (0.0, 1.0))
+    assert careful.chosen.mean() < bold.chosen.mean()
+    assert bold.chosen_bps.mean() < careful.chosen_bps.mean() < careful.best_bps.mean()
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_pusch_knows_who_knows_more() -> None:
+    draw = drawn()
+    torch.manual_seed(0)
+    true = draw(16, 1).expand(16, 48).contiguous()
+    error = draw(16, 48) * 0.6
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, iterations=8)
+    assert np.isclose(pusch.pilot_share, 2 / 14)
+    power = true.abs().square().mean(1, keepdim=True).sqrt()
+    band = Band(true, true + error * power, torch.full((16,), 0.36))
+    found = pusch.run(band, 3.0, np.arange(128) % 16, 64).groupby("receiver")
+    wrong, bits = found.failed.mean(), found.wrong.mean()
+    assert wrong["perfect"] <= wrong["lmmse"] + 0.05 and wrong["lmmse"] <= wrong["ls"] + 0.05
+    assert wrong["predicted"] > wrong["perfect"] + 0.3
+    assert bits["perfect"] < bits["predicted"]
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
+    draw = drawn()
+    torch.manual_seed(0)
+    true, error = draw(2, 16, 1).expand(2, 16, 48)
+    share = 0.2
+    guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, 8, ["perfect", "lmmse", "predicted", "predicted_pilots"])
+    band = Band(true.contiguous(), guess, doubt)
+    wrong = pusch.run(band, 3.0, np.arange(256) % 16, 64).groupby("receiver").failed.mean()
+    assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05
+    assert wrong["perfect"] - 0.02 <= wrong["predicted_pilots"] <= wrong["lmmse"] + 0.02
+    # Without any doubt the pilots are not listened to, with all of it the prediction is not.
+    sure, deaf = (pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse"))
+    y = draw(4, 1, 1, 14, 48)
+    pusch._prior = guess[:4], torch.zeros(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0][:, 0, 0, 0, 0, 0], guess[:4], atol=1e-2)
+    pusch._prior = torch.zeros(4, 48), torch.ones(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0], deaf(y, torch.tensor(0.1))[0], atol=1e-5)
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
+    data, file = trained
+    module = SimpleNamespace(measurements=data)
+    monkeypatch.setattr("gsparc.evaluation.open_runs.datamodule", lambda settings, trusted: module)
+    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
+    answer = knock(COMMANDS["link"].run, "link", [
+        f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
+        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
+        "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
+        f"hydra.run.dir={tmp_path}",
+    ])  # fmt: skip
+    assert answer.status == 0, answer
+    facts = json.loads((tmp_path / "summary.json").read_text())
+    assert {"mcs.png", "bler.png", "acceptance.png"} <= {p.name for p in tmp_path.iterdir()}
+    assert facts["beams/64/gain_db"] > facts["beams/8/gain_db"]
+    assert facts["pusch/qpsk/perfect/4dB/bler"] <= facts["pusch/qpsk/perfect/3dB/bler"]
+    assert facts["pusch/truth"] == "rays" and 0 <= facts["tradeoff/qpsk/predicted/100%"] <= 1
+
+
+def _split():
+    from gsparc.data.splits import Split, indices_hash
+
+    one = fold()
+    whole = type(one)(one.train[:40], one.val, np.concatenate([np.arange(40, 80), one.test]))
+    return Split("toy", (whole,), indices_hash((whole,)))

@@ -1,0 +1,69 @@
+"""`locate`: places from values in the units and shapes of predictions."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+import towns
+from campaigns import powers, spectra
+
+import gsparc
+from gsparc.apps.locate import locate
+from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.locator import trust_state
+from gsparc.apps.locate.search import Unknown
+from gsparc.models import checkpoint
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return towns.trained(spectra(tmp_path_factory.mktemp("located") / "own.npz", rows=80), "gp")
+
+
+def test_a_predicted_spectrum_is_located_where_it_was_predicted(trained):
+    predictor = gsparc.load(trained)
+    low, high = predictor.site.moving_box + predictor.site.origin
+    places = low + (high - low) * np.array([[0.3, 0.4, 0.5], [0.7, 0.5, 0.4]])
+    found = locate(predictor, predictor.spectrum(tx=places))
+    assert np.linalg.norm([one.place for one in found] - places, axis=1).max() < 0.1
+    corner = locate(
+        predictor, predictor.spectrum(tx=places[:1]), where=low[None] + [[0, 0, 0], [0.3, 0.3, 0.1]]
+    )
+    assert (corner[0].place <= low + 0.61).all(), "nowhere else can one stand"
+
+
+def test_areas_are_those_that_were_calibrated(trained, caplog):
+    predictor = gsparc.load(trained)
+    spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    with caplog.at_level(logging.WARNING):
+        before = locate(predictor, spectrum)[0]
+    assert "never calibrated" in caplog.text
+    checkpoint.amend(trained, trust_state(Trust(spread=0.2), Unknown(), 0.9))
+    after = locate(gsparc.load(trained), spectrum)[0]
+    assert after.area > 2 * before.area
+    with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
+        locate(gsparc.load(trained), spectrum, share=0.5)
+
+
+def test_missing_and_silent_stations_are_no_values(tmp_path):
+    predictor = gsparc.load(towns.trained(powers(tmp_path / "own.npz"), "gp"))
+    place = (predictor.site.moving_box + predictor.site.origin).mean(0)
+    power = predictor.rssi(**{predictor.site.moving_end: place[None]})
+    loud, quiet = (locate(predictor, power, silent=silent)[0] for silent in (None, [[True]]))
+    assert quiet.area > loud.area, "below a level is less than at a level"
+    linear = locate(predictor, 10 ** (power.astype(float) / 10), unit="linear")[0]
+    assert np.allclose(linear.place, loud.place) and linear.area == loud.area
+
+
+@pytest.mark.parametrize("values, more, said", [
+    (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
+    (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
+    (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
+    (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
+])  # fmt: skip
+def test_values_of_another_kind_are_refused_in_one_line(trained, values, more, said):
+    with pytest.raises(ValueError, match=said) as raised:
+        locate(gsparc.load(trained), values, **more)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,113 @@
+"""Cells, masses, areas and modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.apps.locate.cells import MARGIN_M, cover, cover_floors, floors
+from gsparc.apps.locate.posterior import Posterior
+
+PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
+
+
+def gaussians(cells, middles, width=0.2):
+    apart = np.linalg.norm(cells.centre[:, None, :2] - np.asarray(middles, float), axis=2)
+    density = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(1) + 1e-30)
+    return Posterior(cells, density - np.log((np.exp(density) * cells.size).sum()))
+
+
+def test_cells_cover_the_plane_that_was_walked():
+    cells = cover(PLACES, 400, False)
+    assert 300 < len(cells) < 600 and (cells.edge[:, 2] == 0).all() and (cells.centre[:, 2] == 1.5).all()
+    assert cells.size.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
+
+
+def test_halves_fill_the_whole():
+    cells = cover(PLACES, 50, False)
+    finer = cells.halved()
+    assert len(finer) == 4 * len(cells) and finer.size.sum() == pytest.approx(cells.size.sum())
+    one = cells.at(np.array([3])).halved()
+    assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
+
+
+def test_cells_near_trained_places():
+    walked = PLACES[PLACES[:, 0] < 1.0]
+    both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
+    around = cover(both, 400, True)
+    assert len(around) < 0.5 * len(cover(both, 400, False))
+    with pytest.raises(ValueError, match="single place"):
+        cover(np.ones((5, 3)), 100, False)
+
+
+def test_cells_where_a_plan_is_open():
+    left = cover(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
+    assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
+    with pytest.raises(ValueError, match="stand nowhere"):
+        cover(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
+
+
+def test_peak_is_between_middles_of_cells():
+    cells = cover(PLACES, 400, False)
+    truth = np.array([2.037, 1.021])
+    found = Posterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
+    cell = cells.centre[found.log_density.argmax()]
+    assert np.linalg.norm(found.peak()[:2] - truth) < 0.3 * np.linalg.norm(cell[:2] - truth)
+    assert found.peak()[2] == 1.5
+
+
+@pytest.mark.slow
+def test_errors_of_recorded_places_widen_an_area():
+    cells = cover(PLACES, 8_000, False)
+    sharp = gaussians(cells, [[2.0, 1.0]])
+    wide = Posterior(cells, sharp.sharp, 0.3)
+    area = cells.size[wide.within(0.9)].sum()
+    assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
+    place = np.array([2.3, 1.1, 1.5])
+    assert wide.at(place) == pytest.approx(wide.log_density[cells.holding(place)], abs=0.05)
+
+
+def test_area_of_a_known_density_holds_its_share():
+    found = gaussians(cover(PLACES, 20_000, False), [[2.0, 1.0]])
+    area = found.cells.size[found.within(0.9)].sum()
+    assert area == pytest.approx(-2 * np.pi * 0.2**2 * np.log(0.1), rel=0.02)
+    assert found.level(np.array([2.0, 1.0, 1.5])) < 0.01 and found.level(np.array([3.9, 1.9, 1.5])) > 0.99
+
+
+def test_two_places_alike_are_two_modes():
+    cells = cover(PLACES, 5_000, False)
+    assert len(gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).modes(0.9)) == 2
+    assert len(gaussians(cells, [[0.8, 1.0]], 0.1).modes(0.9)) == 1
+
+
+def building(count: int = 300) -> np.ndarray:
+    """Places on two floors of 40 x 20 m, the upper one only in its west half."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 1, (count, 3)) * [40, 20, 0.3]
+    upper = rng.random(count) < 0.5
+    places[upper] = places[upper] * [0.5, 1, 1] + [0, 0, 4]
+    return places
+
+
+def test_heights_are_grouped_by_floor():
+    height = building()[:, 2]
+    found = floors(height)
+    assert len(np.unique(found)) == 2 and (np.abs(found - height) < 0.3).all()
+    assert floors(np.array([3.0])).tolist() == [3.0] and len(np.unique(floors(np.zeros(5)))) == 1
+
+
+def test_floors_are_covered_once_and_finer_near_places():
+    places = building()
+    cells = cover_floors(places, around=False)
+    box = np.ptp(places[:, :2], axis=0) + 2 * MARGIN_M
+    assert np.isclose(cells.size.sum(), 2 * box.prod()) and len(cells) <= 8000
+    assert not cells.edge[:, 2].any() and len(np.unique(cells.centre[:, 2])) == 2
+    east = (cells.centre[:, 0] > 26) & (cells.centre[:, 2] > 2)  # where nobody was
+    assert cells.edge[east, 0].min() > cells.edge[~east, 0].min()
+    near = cover_floors(places, around=True)
+    assert len(near) < len(cells) and near.size.sum() < 0.85 * cells.size.sum()
+
+
+def test_single_place_has_cells():
+    cells = cover_floors(np.array([[1e6, 2e6, 5.0]]), around=False)
+    assert np.isclose(cells.size.sum(), (2 * MARGIN_M) ** 2) and (cells.centre[:, 2] == 5).all()

@@ -1,0 +1,145 @@
+"""Where a map lies: rectangles, polygons, floor plans; what cannot be is refused in one line."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+from towns import town_model
+
+import gsparc
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.area import grid_of
+from gsparc.apps.maps.floor_plan import read_plan
+from gsparc.apps.maps.geojson import read_shapes
+from gsparc.data.errors import DataError
+from gsparc.data.links.georeference import Georeference
+
+SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
+
+
+def geojson(path, coordinates=SQUARE):
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": coordinates}))
+    return path
+
+
+def image(path):
+    Image.new("RGB", (200, 100), "white").save(path)
+    return path
+
+
+def test_a_rectangle_is_covered_by_square_cells():
+    grid = grid_of(None, [0, 0, 4, 3], 1.5, 0.5)
+    assert grid.shape == (6, 8) and grid.inside.all() and grid.extent == (0.0, 4.0, 0.0, 3.0)
+    assert grid.places().shape == (48, 3) and (grid.places()[:, 2] == 1.5).all()
+    assert grid.places(np.array([8]))[0].tolist() == [0.25, 0.75, 1.5]
+
+
+def test_a_polygon_keeps_its_holes(tmp_path):
+    grid = grid_of(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
+    assert grid.inside.sum() == 400 - 16
+    assert not grid.inside[9, 9] and grid.inside[0, 0]
+
+
+def test_degrees_are_those_of_the_model(tmp_path):
+    origin = Georeference(47.0, 11.0)
+    square = [[[11.0, 47.0], [11.001, 47.0], [11.001, 47.001], [11.0, 47.001]]]
+    drawn, _ = read_shapes(geojson(tmp_path / "a.json", square), "area", origin)
+    low, high = drawn.bounds[:2], drawn.bounds[2:]
+    assert np.allclose(low, 0, atol=1e-6) and np.allclose(high, [76.06, 111.2], rtol=1e-3)
+
+
+def test_a_plan_lies_where_its_two_points_say(tmp_path):
+    plan = read_plan(image(tmp_path / "p.png"), [[0, 100, 5, 1], [200, 100, 25, 1]])  # 10 pixels a metre
+    assert np.allclose(plan.corners(), [[5, 11], [25, 11], [25, 1], [5, 1]])
+    turned = read_plan(tmp_path / "p.png", [[0, 0, 0, 0], [100, 0, 0, 10]])  # its right is north
+    assert np.allclose(turned.corners()[1], [0, 20]) and np.allclose(turned.corners()[3], [10, 0])
+    grid = grid_of(None, None, 1.5, 1.0, plan)
+    assert grid.inside.sum() == 200
+
+
+def refused(said, call, *given, **how):
+    """In one line."""
+    with pytest.raises(DataError, match=said) as caught:
+        call(*given, **how)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("said, how", [
+    ("x1 must be above", {"area": [3, 0, 1, 2]}),
+    (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
+    ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
+    ("no such file", {"area": "missing.geojson"}),
+    (r"or a \*.geojson file", {"area": "area.txt"}),
+    (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
+    ("nothing says where", {"area": None}),
+    ("above 0", {"step_m": 0}),
+    ("above 0", {"step_m": -1.0}),
+    ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
+    ("finite", {"height_m": float("nan")}),
+])  # fmt: skip
+def test_spoilt_grids(said, how):
+    refused(said, grid_of, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
+
+
+@pytest.mark.parametrize("said, content", [
+    ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
+    ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
+    ("not readable", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
+    ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
+    ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
+    ("no polygon", '{"type": "FeatureCollection", "features": []}'),
+    ("not readable", "not json"),
+    ("not readable", "[1, 2]"),
+])  # fmt: skip
+def test_spoilt_polygons(tmp_path, said, content):
+    path = tmp_path / "a.geojson"
+    path.write_text(content)
+    refused(said, grid_of, None, str(path), 1.5, 0.5)
+
+
+@pytest.mark.parametrize("said, points, content", [
+    ("has no scale", None, None),
+    ("two points", [[0, 0, 0, 0]], None),
+    ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
+    ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
+    ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
+    ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
+    ("no such file", None, ""),
+])  # fmt: skip
+def test_spoilt_plans(tmp_path, said, points, content):
+    path = image(tmp_path / "p.png")
+    if content is not None:
+        path.unlink()
+    if content:
+        path.write_text(content)
+    refused(said, read_plan, path, points)
+
+
+def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
+    with (tmp_path / "p.png").open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, content in (
+            (b"IHDR", struct.pack(">IIBBBBB", 50_000, 50_000, 8, 0, 0, 0, 0)),
+            (b"IDAT", b"x"),
+        ):
+            file.write(struct.pack(">I", len(content)) + kind + content)
+            file.write(struct.pack(">I", zlib.crc32(kind + content)))
+    said = r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
+    refused(said, read_plan, tmp_path / "p.png", None)
+
+
+@pytest.mark.parametrize("said, how", [
+    ("no station 'nord'", {"stations": ["nord"]}),
+    ("name one", {"stations": []}),
+    ("0 to 1", {"load": 1.5}),
+    ("one per station", {"load": [1, 1, 1]}),
+    ("no station 'south'", {"load": {"south": 1}}),
+    ("stood still", {"other_end": [0, 0, 1]}),
+])  # fmt: skip
+def test_spoilt_maps(said, how):
+    refused(said, map_of, gsparc.load(town_model()), **{"step_m": 5.0, **how})

@@ -1,0 +1,78 @@
+"""A GeoTIFF lies at the right place on Earth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from towns import town_model
+
+import gsparc
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
+from gsparc.apps.maps.planning import plan_next
+from gsparc.data.errors import DataError
+from gsparc.data.links.georeference import Georeference
+
+ORIGIN = Georeference(47.2, 11.3)
+
+
+def test_read_back_at_the_right_place(tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
+    from rasterio.warp import transform
+
+    found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
+    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
+    with rasterio.open(tmp_path / "map.tif") as file:
+        assert file.descriptions[0] == "power_db" and file.count == 11
+        for row, column in ((0, 0), (14, 19), (7, 3)):
+            x, y = file.xy(len(found.grid.y) - 1 - row, column)
+            longitude, latitude = transform(file.crs, "EPSG:4326", [x], [y])
+            place = np.array([[found.grid.x[column], found.grid.y[row]]])
+            expected = ORIGIN.to_degrees(place)
+            assert np.allclose([latitude[0], longitude[0]], np.ravel(expected), atol=1e-7)
+            (value,) = next(file.sample([(x, y)], indexes=1))
+            assert value == pytest.approx(found.strongest(found.power_db)[row, column])
+
+
+def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
+    """Drawn in degrees with heights and a hole; rasterio masks the file's cells by the same polygon."""
+    pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
+    import rasterio
+    from rasterio.features import geometry_mask
+    from rasterio.warp import transform_geom
+
+    predictor = gsparc.load(town_model())
+    predictor.site = replace(predictor.site, georeference=ORIGIN)
+    rings = [[[5, 5], [75, 10], [60, 55], [10, 50], [5, 5]], [[30, 20], [50, 20], [40, 40], [30, 20]]]
+    degrees = [np.stack([*ORIGIN.to_degrees(np.array(ring, float))[::-1], np.full(len(ring), 570.0)], 1)
+               for ring in rings]  # fmt: skip
+    drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
+    found = map_of(predictor, tmp_path / "area.geojson", step_m=1.0)
+    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
+    with rasterio.open(tmp_path / "map.tif") as file:
+        power = file.read(1)
+        outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
+    assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
+    np.testing.assert_array_equal(np.flipud(power), found.strongest(found.power_db))
+
+
+def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
+    ring = [[11.3, 47.2], [11.301, 47.2], [11.301, 47.2008], [11.3, 47.2]]
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    predictor = gsparc.load(town_model())
+    with pytest.raises(DataError, match="degrees mean nothing to"):
+        map_of(predictor, tmp_path / "area.geojson")
+    with pytest.raises(DataError, match="degrees mean nothing to"):
+        plan_next(predictor, 3, walkable=tmp_path / "area.geojson")
+    with pytest.raises(DataError, match="a rectangle is in metres"):
+        map_of(predictor, [11.3, 47.2, 11.301, 47.2008])
+
+
+def test_asked_for_without_a_place_on_earth():
+    with pytest.raises(DataError, match="unknown origin"):
+        geotiff_wanted(True, None)
+    assert not geotiff_wanted(None, None) and not geotiff_wanted(False, ORIGIN)

@@ -1,0 +1,253 @@
+"""A map is what the model predicts cell by cell, with its layers over stations."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from campaigns import channels
+from scipy.stats import norm
+from towns import MASTS, town_model
+
+import gsparc
+from gsparc.apps.maps.field_map import (
+    ARRAYS,
+    REFUSED,
+    FieldMap,
+    best_server,
+    loads,
+    overlapping,
+    server_chance,
+    sinr,
+)
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.making import _usual, answering, levels_at, map_of
+from gsparc.apps.maps.pictures import Layer, Legend, layers, named_areas, shades
+from gsparc.apps.maps.promise import Promise
+from gsparc.apps.maps.refining import refined
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+from gsparc.data.splits import Fold
+from gsparc.models.registry import method_class
+from gsparc.prediction.predictor import Predictor
+from gsparc.training.context import FitContext
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return gsparc.load(town_model())
+
+
+def test_cells_hold_what_the_model_predicts(predictor):
+    found = map_of(predictor, [0, 0, 80, 60], step_m=4.0, threshold_db=-90)
+    assert found.power_db.shape == (2, 15, 20) and found.power_db.dtype == np.float32
+    place = [found.grid.x[3], found.grid.y[5], 1.5]
+    for number, name in enumerate(found.stations):
+        assert found.power_db[number, 5, 3] == pytest.approx(
+            float(predictor.at(name).rssi(rx=place)[0]), abs=1e-3
+        )
+    assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
+    west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
+    assert (west, east) == (0, 1)
+    assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
+
+
+def test_a_unit_of_maps_changed_their_names_alone(tmp_path):
+    """`unit=dBm` of levels in dBW wrote dBm beside the same numbers and the threshold of the others."""
+    stored = gsparc.load(town_model())
+    predictor = Predictor(stored.method, replace(stored.site, level_unit="dBW"), extra=stored.extra)
+    own = map_of(predictor, step_m=8.0, threshold_db=-90, noise_db=-100)
+    other = map_of(predictor, step_m=8.0, threshold_db=-60, noise_db=-70, unit="dBm")
+    assert (own.unit, other.unit, other.threshold_db) == ("dBW", "dBm", -60)
+    for name in ("power_db", "lower_db", "upper_db"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name) + 30, atol=1e-4)
+    for name in ("expected_error_db", "outage", "sinr_db", "server_chance", "best_server"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
+    assert "[dBm]" in next(iter(layers(other))).legend.label
+    other.save(tmp_path / "map.npz")
+    assert FieldMap.read(tmp_path / "map.npz").unit == "dBm" and other.figures()["map/unit"] == "dBm"
+    with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
+        map_of(predictor, unit="W")
+
+
+def test_chunks_do_not_change_a_map(predictor, monkeypatch):
+    whole = map_of(predictor, step_m=5.0)
+    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 7)
+    monkeypatch.setattr("gsparc.apps.maps.making.BANDS", 13)
+    assert np.allclose(map_of(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
+
+
+def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
+    def slow(*given):
+        time.sleep(0.05)
+        return levels_at(*given)
+
+    monkeypatch.setattr("gsparc.apps.maps.making.levels_at", slow)
+    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 20)
+    began = time.perf_counter()
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    with pytest.raises(KeyboardInterrupt):
+        map_of(predictor, step_m=1.0)
+    assert time.perf_counter() - began < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["joblib", "ray"])
+def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
+    torch.set_num_threads(1)
+    here = map_of(predictor, step_m=1.0)
+    elsewhere(engine)
+    there = map_of(predictor, step_m=1.0)
+    for name in ("power_db", "lower_db", "upper_db", "best_server", "outage"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+
+
+def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
+    found = map_of(predictor, step_m=10.0, stations=["east", 0])
+    both = map_of(predictor, step_m=10.0)
+    assert found.stations == ("east", "west")
+    assert np.array_equal(found.power_db[::-1], both.power_db)
+    assert map_of(predictor, step_m=10.0, stations=["east"]).power_db.shape[0] == 1
+
+
+def test_ratio_of_signal_to_interference_by_hand():
+    power = np.array([[-50.0, np.nan, np.nan], [-60.0, -60.0, np.nan]])
+    assert sinr(power, np.array([1.0, 1.0]), None)[0] == pytest.approx(10)
+    assert sinr(power, np.array([1.0, 0.1]), None)[0] == pytest.approx(20)
+    assert sinr(power, np.ones(2), -60.0)[0] == pytest.approx(10 - 10 * np.log10(2))
+    assert sinr(power, np.ones(2), -80.0)[1] == pytest.approx(20)
+    assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
+    assert best_server(power).tolist() == [0, 1, REFUSED]
+    assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+
+
+def test_ratio_and_overlap_are_within_one_carrier():
+    power = np.array([[-50.0, -90.0], [-52.0, -60.0], [-54.0, -61.0], [-57.0, np.nan]])
+    carrier = np.array([0, 1, 0, 0])
+    assert overlapping(power, carrier).tolist() == [2, 1] and overlapping(power, carrier * 0).tolist() == [
+        3,
+        2,
+    ]
+    found = sinr(power, np.ones(4), None, carrier)
+    assert found[0] == pytest.approx(-50 - 10 * np.log10(10**-5.4 + 10**-5.7)) and np.isnan(found[1])
+
+
+def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
+    stations = replace(predictor.site.stations, carrier_hz=np.array([8e8, 2.6e9]))
+    monkeypatch.setattr(predictor, "site", replace(predictor.site, stations=stations))
+    found = map_of(predictor, step_m=10.0)
+    drawn = {layer.name: layer.values for layer in layers(found)}
+    for number, band in enumerate(("800 MHz", "2600 MHz")):
+        np.testing.assert_array_equal(drawn[f"power {band}"], found.power_db[number])
+        assert (drawn[f"best_server {band}"] == 0).all()
+    assert (drawn["overlap"] == 1).all() and "sinr" not in drawn  # nobody interferes on another carrier
+
+
+def test_sectors_that_err_together_are_told_apart():
+    """The chance of the best server took errors of sectors of one site for independent."""
+    power, error = np.array([[-60.0], [-64.0]]), np.full((2, 1), 6.0)
+    usual, floor = np.full((2, 2), np.nan), np.full(2, -np.inf)
+    alone = server_chance(power, error, usual, floor)[0]
+    together = server_chance(power, error, usual, floor, np.array([[1.0], [0.8]]))[0]
+    assert alone == pytest.approx(norm.cdf(4 / np.hypot(6, 6)))
+    assert together == pytest.approx(norm.cdf(4 / np.sqrt(72 * 0.2)))
+
+
+def test_twenty_one_stations_had_twenty_colours():
+    """Those of neighbours were shades of one hue: areas side by side have different ones, and names."""
+    classes = np.kron(np.arange(24.0).reshape(4, 6), np.ones((6, 6)))
+    found = shades(classes, 24)
+    assert found.min() >= 0 and found.max() < 10
+    grid = found[classes.astype(int)]
+    assert (grid[6:][::6] != grid[:-6][::6]).all() and (grid[:, 6:] != grid[:, :-6]).all()
+    words = tuple(f"cell {i}" for i in range(24))
+    table = Layer("best_server", classes, Legend("", -0.5, 23.5), words).table()
+    assert len(table) == 24 and len(np.unique(table, axis=0)) <= 10
+    named = list(named_areas(classes, words))
+    assert [word for _, _, word in named] == list(words)
+    assert all(classes[row, column] == words.index(word) for row, column, word in named)
+
+
+def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(predictor):
+    power = np.array([[-60.0, -60.0, np.nan, -60.0], [-90.0, -60.0, np.nan, np.nan]])
+    error, never = np.full((2, 4), 5.0), np.full((2, 2), np.nan)
+    free = server_chance(power, error, never, np.full(2, -np.inf))
+    assert free[:2] == pytest.approx([1.0, 0.5], abs=1e-4) and np.isnan(free[2]) and free[3] == 1
+    usual = np.array([[-80.0, 5.0], [-50.0, 5.0]])  # the second is unknown in the last cell, mostly louder
+    told = server_chance(power, error, usual, np.array([-60.0, -100.0]))
+    assert told[0] == pytest.approx(0.5, abs=1e-4) and told[3] == pytest.approx(0.5 * 0.0786, abs=1e-3)
+    quiet = map_of(predictor, step_m=10.0)
+    loud = map_of(predictor, step_m=10.0, noise_db=0.0)
+    assert not quiet.unsure.any() and loud.unsure.all() and loud.figures()["map/server_unsure"] == 1
+    unsure = {layer.name: layer.unsure for layer in layers(loud)}
+    assert unsure["best_server"] is not None and unsure["power"] is None
+
+
+def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
+    level, row = np.append(np.linspace(-100, -50, 101), -90.0), np.arange(102)
+    evidence = Evidence(level, level, np.ones(102), np.zeros(102), row, (row == 101) * 1, row == 101)
+    usual, floor = _usual(Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0), [0, 1], None)
+    assert floor == pytest.approx([-99.5, -90]) and usual[0] == pytest.approx([-75, 14.58], abs=0.01)
+    assert _usual(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
+
+
+def test_saved_and_read_back(predictor, tmp_path):
+    made = map_of(predictor, [0, 0, 80, 60], step_m=8.0)
+    made.save(tmp_path / "map.npz")
+    found = FieldMap.read(tmp_path / "map.npz")
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+    assert found.stations == ("west", "east") and found.grid.step == pytest.approx(8.0)
+    assert made.figures()["map/cells"] == made.grid.inside.sum()
+    (tmp_path / "other.npz").write_bytes(b"no archive")
+    with pytest.raises(DataError, match="no map that can be read"):
+        FieldMap.read(tmp_path / "other.npz")
+
+
+def test_spectra_have_no_power(predictor, monkeypatch):
+    monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
+    with pytest.raises(DataError, match="no received power"):
+        map_of(predictor)
+
+
+def test_interpolated_cells_are_as_exact_as_asked_for():
+    def ask(cells):
+        row, column = np.divmod(cells, 200)
+        x, y = column / 10, row / 10
+        return np.column_stack(
+            [-20 * np.log10(1 + np.hypot(x - 5, y - 4)), 2 + np.sin(x / 3) * np.cos(y / 4)]
+        )
+
+    inside = np.ones((150, 200), bool)
+    inside[100:, :60] = False
+    every, count = refined(ask, inside, 1, 0.1)
+    few, asked = refined(ask, inside, 4, 0.1)
+    assert count == inside.sum() and asked < 0.2 * count
+    assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.15
+
+
+def test_channels_have_a_power_and_paths(tmp_path):
+    data = load_own(channels(tmp_path / "own.npz"))
+    method, rows = method_class("image_source_gp")(budget_s=1.0), np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path))
+    found = map_of(Predictor(method, data.site), step_m=0.5, height_m=1.2)
+    assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
+    assert (found.expected_error_db > 0).all() and set(found.extra) == {"delay_spread_ns", "direction_deg"}
+    assert (found.extra["delay_spread_ns"] >= 0).all() and (found.extra["delay_spread_ns"] < 100).all()
+    near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
+    place = found.grid.places(np.array([near]))[0, :2]
+    assert np.linalg.norm(place - [1, 1]) < 1.0
+
+
+def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
+    nothing = Evidence(*(np.zeros(0) for _ in range(7)))
+    promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
+    names, notes = answering(predictor, None, promise)
+    assert names == ["west"] and "east was never heard" in notes[0]
+    with pytest.raises(DataError, match="never heard"):
+        answering(predictor, ["east"], promise)

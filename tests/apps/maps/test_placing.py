@@ -1,0 +1,59 @@
+"""One more station goes where the others do not serve, by models that know stations they never heard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from towns import MASTS, town_file, town_model
+
+import gsparc
+from gsparc.apps.maps.placing import NewStation, new_station_error, place_next
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+from gsparc.data.splits import Fold
+from gsparc.models import checkpoint
+from gsparc.models.per_station import for_links
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    folder: Path = tmp_path_factory.mktemp("together")
+    data = load_own(town_file(folder / "town.npz"))
+    method, rows = for_links(method_class("distance_law"), data), np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(folder, stations="together"))
+    checkpoint.save(folder / "model.ckpt", method)
+    return method, data, folder / "model.ckpt"
+
+
+@pytest.mark.parametrize("goal", ["coverage", "worst"])
+def test_the_best_place_is_far_from_those_that_serve(together, goal):
+    predictor = gsparc.load(together[2])
+    found = place_next(predictor, goal=goal, threshold_db=-75.0, count=60, error=NewStation(3.0, 1.0, 4))
+    apart = np.linalg.norm(found.places[0, :2] - MASTS[:, :2], axis=1)
+    assert apart.min() > 20 and found.goal[0] > found.before
+    assert (found.low <= found.goal + 0.05).all() and (found.goal <= found.high + 0.05).all()
+    assert (np.diff(found.goal) <= 1e-12).all() and (found.places[:, 2] == 8).all()
+
+
+def test_two_stations_leave_none_out(together):
+    method, data, _ = together
+    rows = np.arange(len(data))
+    fold = Fold(rows, rows[:0], rows[:1])
+    assert new_station_error(method, method_class("distance_law"), data, fold, FitContext()).stations == 0
+
+
+@pytest.mark.parametrize("said, how", [
+    ("one of coverage, worst", {"goal": "best"}),
+    ("at least 1", {"count": 0}),
+    ("no such file", {"sites": "missing.geojson"}),
+    ("stations=together", {}),
+])  # fmt: skip
+def test_spoilt_wishes(together, said, how):
+    model = together[2] if how else town_model()  # whose stations are known ones alone
+    with pytest.raises(DataError, match=said) as caught:
+        place_next(gsparc.load(model), threshold_db=-75.0, **how)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,107 @@
+"""Places to measure: they fall where nobody measured, take error away, and make a short walk."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from towns import town_model
+
+import gsparc
+from gsparc.apps.maps.covariance import ErrorCovariance
+from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.planning import Tour, plan_next
+from gsparc.apps.maps.promise import Promise
+from gsparc.data.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return gsparc.load(town_model())
+
+
+def test_gains_are_what_conditioning_takes_away():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    one = ErrorCovariance(root @ root.T, 0.3, np.ones(6))
+    every = np.ones(6, bool)
+    gains, before = one.gains(every), one.variances().sum()
+    for place in range(6):
+        twin = ErrorCovariance(one.covariance.copy(), 0.3, np.ones(6))
+        twin.measured(place)
+        assert before - twin.variances().sum() == pytest.approx(gains[place])
+
+
+def test_error_falls_and_places_lie_where_data_do_not(predictor):
+    area = [-40, 0, 80, 60]  # nobody was west of 0
+    found = plan_next(predictor, 8, area)
+    assert len(found.places) == 8 and found.after_db < found.before_db
+    assert (np.diff(found.expected_db) < 0).all() and (found.places[:, 0] < 5).mean() > 0.7
+    random = np.median(found.error_before)
+    assert found.error_before[found.at[:, 0] < -20].mean() > random
+
+
+def test_a_first_design_spreads_over_the_floor():
+    found = plan_next(None, 9, [0, 0, 30, 30])
+    apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1) + 99 * np.eye(9)
+    assert apart.min() > 5 and found.after_db < 0.8 * found.before_db
+
+
+def test_corridors_and_a_length(tmp_path, predictor):
+    lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
+    (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
+    found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", route=True, start=[5, 5])
+    on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
+    assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
+    short = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
+    assert short.length_m <= 30 and len(short.places) >= 1
+
+
+def test_it_stops_where_a_place_gains_too_little(predictor):
+    found = plan_next(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
+    assert 0 < len(found.places) < 50 and "less than 0.1 dB" in found.stopped
+    assert len(plan_next(predictor, 50, least_gain_db=50).places) == 0
+
+
+def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predictor):
+    rng = np.random.default_rng(0)
+    level, spread, row = rng.normal(size=60), np.ones(60), np.arange(60)
+    evidence = Evidence(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
+    known = np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)]) - predictor.site.origin
+    promise = Promise(evidence, known, np.arange(120) % 2, 5.0)
+    found = plan_next(predictor, 6, promise=promise)
+    reach = promise.calibration().reach
+    assert cKDTree(known + predictor.site.origin).query(found.at)[0].max() <= reach + found.grid.step < 10
+    assert found.places[:, 0].max() < 50 and not found.grid.inside[:, -1].any()
+    assert plan_next(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
+
+
+def test_a_long_walk_for_nothing_was_not_called_so(predictor):
+    found = plan_next(predictor, 1, route=True)
+    assert "hardly worth it: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
+    assert not plan_next(None, 9, [0, 0, 30, 30]).in_vain
+
+
+def test_a_walk_is_not_longer_than_it_must_be():
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.permutation(12), np.zeros(12), np.zeros(12)])
+    tour = Tour(np.zeros(2), None)
+    for place in places:
+        tour.add(place)
+    assert Tour.length_of(places[tour.order()], np.zeros(2)) == pytest.approx(11)
+
+
+@pytest.mark.parametrize("how, said", [
+    ({"count": 0}, "at least 1"),
+    ({"count": 2, "route_m": -1}, "above 0"),
+    ({"count": 2, "start": [1]}, r"\[x,y\]"),
+    ({"count": 2, "least_gain_db": -1}, "at least 0"),
+    ({"count": 2, "length_m": 0}, "above 0"),
+    ({"count": 2, "area": None}, "nothing says where"),
+    ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
+])  # fmt: skip
+def test_spoilt_wishes(how, said):
+    with pytest.raises(DataError, match=said):
+        plan_next(None, **{"area": [0, 0, 9, 9], **how})

@@ -1,0 +1,47 @@
+"""Drawn units and colours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.pictures import GREY, Legend
+from gsparc.apps.view.building import Building, build
+from gsparc.apps.view.scene import EXTENT, Frame
+from gsparc.data.walls import SceneWalls
+
+
+def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
+    places = np.array([[4.5e6, 5.1e5, 0], [4.5e6 + 2000, 5.1e5 + 900, 30]])
+    frame = Frame.around(places)
+    drawn = frame.drawn(places)
+    assert drawn.dtype == np.float32 and np.ptp(drawn, axis=0).max() == EXTENT
+    np.testing.assert_allclose(frame.world(drawn), places, atol=1e-3)
+
+
+def test_one_place_is_a_site_too():
+    frame = Frame.around(np.zeros((1, 3)))
+    assert np.isfinite(frame.drawn(np.ones((2, 3)))).all()
+
+
+def test_values_that_are_not_known_are_grey():
+    legend = Legend.over("level", np.array([np.nan, 0.0, 1.0, np.inf]))
+    found = legend.of(np.array([np.nan, 0.0, 1.0, 5.0]))
+    assert tuple(found[0]) == GREY and (found[2] == found[3]).all() and (found[1] != found[2]).any()
+    assert Legend.over("nothing", np.full(3, np.nan)).high > Legend.over("nothing", np.full(3, np.nan)).low
+
+
+def test_a_floor_plan_and_the_grid_lie_beneath_the_plane_and_the_walls(power_view):
+    """The plan lay at the height of the plane: of each other half was hidden."""
+    viewed, plan = power_view.viewed, FloorPlan(np.zeros((60, 80, 3), np.uint8), 1 + 0j, 60j)
+    low = viewed.heights()[0]
+    scene = build(viewed, Building(plan), "west", None)
+    assert scene.ground < scene.part("floor plan").corner[2] < low <= power_view.grid.height
+    wall = np.array([[0.0, 0, -9], [9, 0, -9], [9, 0, 3]])
+    deep = build(viewed, Building(plan, SceneWalls((wall,), np.zeros((0, 2, 3)))), "west", None)
+    assert deep.part("floor plan").corner[2] < -9 < low
+
+
+def test_heights_of_a_plane_are_whole_centimetres(power_view):
+    low, high = power_view.viewed.heights()
+    assert (round(low, 2), round(high, 2)) == (low, high) and low <= power_view.grid.height <= high

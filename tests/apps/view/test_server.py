@@ -1,0 +1,269 @@
+"""The server without a browser: a client whose scene and panel are viser's own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import re
+import socket
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from campaigns import spectra
+from towns import trained
+
+import gsparc
+from gsparc.apps.maps import map_of
+from gsparc.apps.maps.pictures import layers
+from gsparc.apps.view.site_view import SiteView, grid_for
+from gsparc.apps.view.viewed import open_viewed
+
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
+
+import msgspec  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
+from gsparc.apps.view.server.page import page  # noqa: E402
+from gsparc.apps.view.server.serve import Server  # noqa: E402
+from gsparc.apps.view.server.session import CLOUD, Session  # noqa: E402
+
+
+@pytest.fixture
+def visit():
+    """`visit(view)`: a session of a client on a server that nobody else visits."""
+    server, work = viser.ViserServer(host="127.0.0.1", port=0, verbose=False), LatestJobQueue()
+
+    def come(view, number=0):
+        client = SimpleNamespace(
+            client_id=number, scene=server.scene, gui=server.gui, camera=server.initial_camera,
+            atomic=server.atomic,
+        )  # fmt: skip
+        return Session(client, view, work)
+
+    yield come
+    work.close()
+    server.stop()
+
+
+def wait(until, seconds=20.0):
+    """Whether something came true in time."""
+    end = time.monotonic() + seconds
+    while not until() and time.monotonic() < end:
+        time.sleep(0.01)
+    return until()
+
+
+def settle(session):
+    assert wait(lambda: not len(session.work)), "work is left"
+
+
+def objects():
+    """That are alive."""
+    gc.collect()
+    return len(gc.get_objects())
+
+
+class Visitor:
+    """A client over a socket of its own, that says where its camera is and reads what comes."""
+
+    def __init__(self, server):
+        there = set(server.sessions)
+        self.socket = connect(
+            server.address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None, compression=None,
+        )  # fmt: skip
+        camera = {"position": (0.0, -9, 8), "fov": 1.3, "near": 0.01, "far": 1e3, "look_at": (0.0, 0, 0)}
+        camera |= {"image_height": 700, "image_width": 1100, "up_direction": (0.0, 0, 1)}
+        self.say("ViewerCameraMessage", wxyz=(1.0, 0, 0, 0), **camera)
+        threading.Thread(target=self.read, daemon=True).start()
+        assert wait(lambda: set(server.sessions) - there)
+        (self.number,) = set(server.sessions) - there
+        self.session = server.sessions[self.number]
+
+    def say(self, kind, **fields):
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def read(self):
+        with contextlib.suppress(ConnectionClosed):
+            for _ in self.socket:
+                pass
+
+    def drag(self, place):
+        at = tuple(float(value) for value in self.session.scene.frame.drawn(np.asarray(place)))
+        fields = {"name": "/rx", "wxyz": (1.0, 0, 0, 0), "position": at, "owner": str(self.number)}
+        self.say("TransformControlsUpdateMessage", **fields)
+
+
+def drag(session, end, place):
+    """As viser calls it while a handle is dragged."""
+    session.gizmos[end].position = session.scene.frame.drawn(np.asarray(place))
+    asyncio.run(session._dragged(end)(SimpleNamespace(target=session.gizmos[end])))
+
+
+def test_a_drag_is_answered_with_what_the_model_says_there(visit, power_view):
+    session = visit(power_view)
+    drag(session, "rx", [20.0, 30.0, 1.5])
+    settle(session)
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.answer_text.content)[1])
+    asked = power_view.viewed.predictor_of("west")
+    assert said == pytest.approx(float(asked.rssi(rx=[20.0, 30.0, 1.5])[0]), abs=0.06)
+    assert session.vectors["rx"].value == pytest.approx((20.0, 30.0, 1.5), abs=1e-3)
+    assert "cells of 2 m, " in session.progress.content
+
+
+def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view):
+    session = visit(spectrum_view)
+    settle(session)
+    before, panel = session.nodes["sphere"].colors.copy(), session.picture.image.copy()
+    low, high = spectrum_view.viewed.box()
+    drag(session, "tx", low + 0.2 * (high - low))
+    settle(session)
+    assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
+    session._show_only(CLOUD, "ellipsoids")
+    assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
+
+
+def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
+    session = visit(SiteView(open_viewed(trained(spectra(tmp_path / "rx.npz", moving="rx"), "idw"))))
+    drag(session, "rx", [0.2, 0.1, -0.3])
+    settle(session)
+    where = session.scene.frame.world(session.nodes["sphere"].position)
+    np.testing.assert_allclose(where, [0.2, 0.1, -0.3], atol=1e-5)
+
+
+def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
+    found = map_of(gsparc.load(power_view.viewed.name), [0, 0, 80, 60], step_m=8.0, height_m=3.0)
+    made = [layer for layer in layers(found) if not layer.words]
+    view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
+    session = visit(view)
+    settle(session)
+    session.chosen.value = "map: outage"
+    session.want_plane()
+    settle(session)
+    assert session.nodes["plane"].image.shape[:2] == found.grid.shape
+    assert "probability of less than" in session.legend.content
+    session.chosen.value = "nothing"
+    session.want_plane()
+    settle(session)
+    assert "plane" not in session.nodes
+
+
+def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
+    """Where both ends moved the plane stayed that of the transmitter's first place."""
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(0, 10, (2, 60, 3))
+    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
+    file = tmp_path / "both.npz"
+    np.savez(file, tx_position=ends[0], rx_position=ends[1], rssi_db=power, carrier_hz=1e9)
+    viewed = open_viewed(trained(file, "idw"))
+    session = visit(SiteView(viewed, grid=grid_for(viewed, {"step_m": 2.0})))
+    settle(session)
+    before = session.plane.level_db
+    drag(session, "rx", [1.0, 1.0, 1.0])
+    settle(session)
+    assert session.plane.level_db is before
+    drag(session, "tx", [9.0, 9.0, 9.0])
+    settle(session)
+    assert np.abs(session.plane.level_db - before).max() > 1
+    assert "distance alone" in session.answer_text.content
+
+
+def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, monkeypatch):
+    """Pictures of a station were made on the event loop: all clients stood still for seconds."""
+    session = visit(power_view)
+    settle(session)
+    make, go = SiteView._make, threading.Event()
+    monkeypatch.setattr(SiteView, "_make", lambda view, name: go.wait(20) and make(view, name))
+    choosing = threading.Thread(target=session._station_changed, args=("east",))
+    choosing.start()
+    drag(session, "rx", [20.0, 30.0, 1.5])
+    settle(session)
+    assert session.station == "west" and "receiver at 20.00, 30.00" in session.answer_text.content
+    assert "being prepared" in session.title.content and not go.is_set()
+    go.set()
+    choosing.join()
+    settle(session)
+    assert session.station == "east" and session.title.content.endswith("east**")
+
+
+def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):
+    session = visit(power_view)
+    settle(session)
+    first = session.answer_text.content
+    session._station_changed("east")
+    settle(session)
+    assert session.answer_text.content != first and "east" in session.title.content
+    session._go("next weak place")
+    settle(session)
+    level = session.plane.level_db
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.answer_text.content)[1])
+    assert said == pytest.approx(np.nanmin(level), abs=0.1)
+    here = session.places["rx"]
+    session._go("next weak place")
+    settle(session)
+    assert np.linalg.norm(session.places["rx"] - here) > 5  # it stayed where it was, however often one asked
+    session.chosen.value = "power beyond distance"
+    session.want_plane()
+    settle(session)
+    assert "more than distance alone explains" in session.legend.content and not session.visited
+    law, still = session.one.about.usual, power_view.viewed.still("east")
+    far = np.linalg.norm(session.plane.grid.places() - still, axis=1).reshape(level.shape)
+    np.testing.assert_allclose(session.plane.level_db, level - law.at(far), atol=1e-6)
+
+
+def test_drags_leave_nothing_behind(visit, spectrum_view):
+    session = visit(spectrum_view)
+    settle(session)
+    nodes = len(session.client.scene._handle_from_node_name)
+    low, high = spectrum_view.viewed.box()
+    held = 0
+    for count, share in enumerate(np.linspace(0, 1, 240)):
+        drag(session, "tx", low + share * (high - low))
+        if count % 3 == 2:
+            settle(session)  # so that each third is answered
+        if count == 59:
+            held = objects()
+    assert session.answers >= 80 and objects() < held + 30  # half a one of each answer since
+    assert len(session.client.scene._handle_from_node_name) == nodes
+
+
+def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
+    server = Server(power_view, port=0)
+    try:
+        one, two = Visitor(server), Visitor(server)
+        assert wait(lambda: one.session.answers and two.session.answers)
+        two.drag([20.0, 30.0, 1.5])
+        assert wait(lambda: "receiver at 20.00, 30.00" in two.session.answer_text.content)
+        assert "receiver at 20.00, 30.00" not in one.session.answer_text.content
+        two.socket.socket.shutdown(socket.SHUT_RDWR)  # without a word
+        assert wait(lambda: set(server.sessions) == {one.number})
+        one.drag([40.0, 10.0, 1.5])
+        assert wait(lambda: "receiver at 40.00, 10.00" in one.session.answer_text.content)
+        assert wait(lambda: not len(server.work)) and server.address.startswith("http://127.0.0.1:")
+    finally:
+        server.stop()
+
+
+def test_a_page_showed_one_of_several_stations(power_view):
+    text = page(power_view, steps=8)
+    assert "nothing is computed here" in text and text.rstrip().endswith("</html>") and len(text) > 500_000
+    assert "for 2 of 2 stations (west, east), one after another" in text and "plays 8 recorded places" in text
+    assert "west: measured received power" in text and "east: measured received power" in text
+    assert "for 1 of 2 stations (west); station=NAME shows another" in page(power_view, steps=2)
+
+
+@pytest.mark.slow
+def test_a_page_opens_from_its_file_and_asks_for_nothing(browser, tmp_path, spectrum_view):
+    file = tmp_path / "page.html"
+    file.write_text(page(spectrum_view, steps=4), encoding="utf-8")
+    browser.get(file.as_uri())
+    assert "nothing is computed here" in browser.find_element("css selector", "details").text
+    assert wait(lambda: browser.find_elements("css selector", "canvas"), 30)
+    asked = browser.execute_script("return performance.getEntriesByType('resource').map(e => e.name)")
+    assert not [name for name in asked if name.startswith(("http:", "https:", "ws:"))]

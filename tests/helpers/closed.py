@@ -1,0 +1,33 @@
+"""Closed forms fitted to rows, and read back, for tests."""
+
+from __future__ import annotations
+
+import io
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.closed_form import ClosedForm, restored, stored
+from gsparc.training.context import FitContext
+
+Form = TypeVar("Form", bound=ClosedForm)
+
+
+def fitted_to(
+    method: Form, data: Measurements, rows: np.ndarray, budget_s: float | None = None
+) -> tuple[Form, tuple[str, ...]]:
+    """The method fitted to rows (n,), and its notes."""
+    context = FitContext(budget_s=budget_s)
+    return method, method.fit(data, Fold(rows, rows[:0], rows[:0]), context).notes
+
+
+def read_back(method: Form) -> Form:
+    """What is read from a file of its stored state."""
+    file = io.BytesIO()
+    torch.save(stored(method), file)
+    file.seek(0)
+    assert method.site is not None
+    return restored(method.site, torch.load(file, weights_only=True))
