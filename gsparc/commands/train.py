@@ -126,7 +126,7 @@ def train(
         config: as composed from conf/train.yaml.
         run_dir: where checkpoints, curves, pictures and `summary.json` go.
         begun: what it begins with, where that was read before.
-        in_full: whether queries are timed and pictures are drawn, too.
+        in_full: whether it says what it learns from, times queries and draws pictures, too.
 
     Returns:
         The facts of `summary.json`, and the objects they were computed from.
@@ -141,6 +141,8 @@ def train(
         run_id = summary.new_run_id()
         resumes = _resumes(config, len(split.folds))
         _check(config, method, data, split, resumes)
+        if in_full:
+            _say(config, method, data, split)
         write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
 
         with tracking.opened(config) as loggers:
@@ -217,7 +219,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
 def _check(
     config: DictConfig, method: Method, data: Measurements, split: Split, resumes: Sequence[Path | None]
 ) -> None:
-    """Refuse now what would be found after the training; say what is learned from, and what is guessed.
+    """Refuse now what would be found after the training.
 
     Raises:
         ValueError: an objective, a file of walls, a split, weights to start from or a resume that cannot be.
@@ -225,12 +227,16 @@ def _check(
     objective_of(config, data.site.scored)
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
-    for topic, sentence in in_short(data, split):
-        log.info("%-10s%s", topic, sentence)
     if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
         raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
     if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+
+
+def _say(config: DictConfig, method: Method, data: Measurements, split: Split) -> None:
+    """Say what is learned from, and what is guessed."""
+    for topic, sentence in in_short(data, split):
+        log.info("%-10s%s", topic, sentence)
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
