@@ -211,6 +211,10 @@ def run_stage(
     options["max_epochs"] = -1
     heeded.count("trainer", "callbacks")
     processes = Processes.named(make.keywords.get("strategy"))
+    if module.count is None:  # networks of published methods make tensors of their own, on the CPU
+        if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
+            log.warning("published methods train in one process on the CPU, whatever trainer= says")
+        processes, options = None, {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"}
     if processes is not None:
         options["strategy"] = processes
     trainer = make(

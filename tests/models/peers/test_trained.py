@@ -168,6 +168,14 @@ def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory
     assert list(Path().iterdir()) == []
 
 
+def test_a_peer_trains_on_the_cpu_whatever_the_trainer_says(tmp_path, caplog):
+    """Under the Trainer it would have been moved to a device, and its own tensors not."""
+    data, fold = lobes(tmp_path)
+    trainer = partial(DEFAULTS, accelerator="gpu", devices=1, strategy="ddp")
+    brief("nerf2", max_steps=2).fit(data, fold, FitContext(tmp_path, trainer=trainer))
+    assert "in one process on the CPU" in caplog.text
+
+
 def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):
     fold = folds(30).folds[0]
     for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi")):
