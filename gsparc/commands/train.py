@@ -135,9 +135,9 @@ def train(
         ValueError: bad data, settings or checkpoint, one line each; or another run writes there.
     """
     with locked(run_dir):
+        _set_earlier_aside(config, run_dir)
         begun = begun or begin(config)
         method, reads, split, data = begun.method, begun.reads, begun.split, begun.module.measurements
-        _set_earlier_aside(config, run_dir)
         run_id = summary.new_run_id()
         resumes = _resumes(config, len(split.folds))
         _check(config, method, data, split, resumes)
