@@ -113,7 +113,7 @@ class TrainedPeer(Method):
     resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
-    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare/cells)
+    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
