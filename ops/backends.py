@@ -19,6 +19,7 @@ def choose(name: str | None, device: torch.device) -> ModuleType:
     if name is None:
         name = device.type
     backend = named(name)
+    # The reference runs wherever torch does.
     if name in ("cpu", "cuda") and device.type != name:
         raise BackendUnavailable(f"backend {name!r} needs tensors on {name}, these are on {device}")
     return backend

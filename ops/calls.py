@@ -34,6 +34,7 @@ _C_TYPES: dict[type, Any] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: ct
 class _Settings(ctypes.Structure):
     """`KernelSettings<double>` of csrc/layout.h."""
 
+    # In the order of `KernelSettings`, which is that of the structure in C.
     _fields_ = tuple((name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items())
 
 
@@ -64,6 +65,7 @@ def call_for(
     settings: KernelSettings | None = None,
 ) -> Call:
     """Return a call in the precision and on the device of `like`; the caller keeps the tensors alive."""
+    # Tensors on the CPU are on device -1.
     call = Call(like.dtype == torch.float64, torch.get_num_threads(), max(like.get_device(), 0))
     call.sizes[: len(sizes)] = sizes
     if numbers:

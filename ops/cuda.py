@@ -101,6 +101,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     if count * n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
         return replace(plan, buffers=Buffers._make([*zeros, buffers.entries.new_zeros(starts)]))
+    # Status of the plan, and how many entries it needs.
     verdict = means.new_empty(2, dtype=torch.int64)
     run_on_plan("plan", plan, gaussians, ids, plan.means2d, plan.radii, plan.visible, verdict)
     key = (count, n, plan.settings)
@@ -114,6 +115,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
         # For graphs captured later, which have room for the largest plan so far.
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
+    # Starts of the tiles, then a Gaussian and a slot for each entry.
     entries = means.new_empty(starts + 2 * capacity, dtype=torch.int32)
     plan = replace(plan, buffers=buffers._replace(entries=entries))
     run_on_plan("bin", plan, gaussians)
@@ -171,6 +173,7 @@ def _composite_backward(
 
 @kernel("weights", "cuda")
 def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> Any:
+    # The kernel writes both sums side by side.
     sums = out[0].new_empty(*out[0].shape, 2)
     if sums.numel():
         run_on_plan("weights", plan, gaussians, sums, None, None)
@@ -190,6 +193,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     """Return the order (V,) of visible Gaussians; tiles' starts and ends, entries' ranks and 32 weights."""
     means, buffers, capacity = gaussians.means, plan.buffers, capacity_of(plan)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
+    # A frozen entry is a block of weights, one for each pixel of its tile.
     check_memory(capacity, pixels * means.element_size())
     blocks = means.new_zeros(capacity, pixels)
     starts = buffers.entries[: tiles(plan.settings) + 1].clone()

@@ -48,6 +48,7 @@ class Library:
             function = self._functions[name] = getattr(self._loaded, f"gsparc_{name}")
             function.restype, function.argtypes = ctypes.c_int64, [ctypes.POINTER(Call)]
         result = function(ctypes.byref(call))
+        # Negative results are CUDA's errors, others a kernel's own.
         if result < 0:
             raise RuntimeError(f"CUDA kernel {name}: {self._loaded.gsparc_error(-result).decode()}")
         return result
@@ -177,6 +178,7 @@ def compile_to(path: Path, command: list[str]) -> None:
     if process.returncode:
         unfinished.unlink(missing_ok=True)
         lines = (process.stderr or process.stdout).strip().splitlines()
+        # Compilers print much around the one line that names the error.
         first = next(
             (line for line in lines if "error" in line or "fatal" in line), lines[0] if lines else ""
         )

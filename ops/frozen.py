@@ -77,4 +77,5 @@ class FrozenPlan:
             raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
         batch = features if features.dim() == 3 else features.unsqueeze(0)
         image = backends.named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
+        # The first and last of (B, N, C): B and C.
         return image.unflatten(0, batch.shape[::2]) if features.dim() == 3 else image

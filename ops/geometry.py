@@ -135,6 +135,7 @@ class SphereGrid:
             raise ValueError(f"{self.width} columns of {self.azimuth_step} rad exceed the circle")
         if self.width > WIDEST_GRID:
             raise ValueError(f"a grid has at most {WIDEST_GRID} columns, got {self.width}")
+        # Centres may lie on the poles; cells beyond them are cut off.
         last = self.first_elevation + (self.height - 1) * self.elevation_step
         if self.first_elevation < -math.pi / 2 - 1e-6 or last > math.pi / 2 + 1e-6:
             raise ValueError(
@@ -144,6 +145,7 @@ class SphereGrid:
     @property
     def periodic(self) -> bool:
         """Whether the columns close the circle, so that footprints wrap in azimuth."""
+        # A millionth of a radian: steps that a file has rounded still close the circle.
         return abs(self.width * self.azimuth_step - 2 * math.pi) < 1e-6
 
     @property

@@ -71,6 +71,7 @@ def rasterize(
     strongest = validation.strongest(gaussians).opacities
     inputs = contiguous((*gaussians, pose.position, pose.rotation, features))
     tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((strongest, ids)))
+    # The kernel counts the entries, and refuses more than the bound before it allocates them.
     sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
     screen = means2d, radii, visible
     status = calls.run("rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings)
@@ -99,6 +100,7 @@ def _composite_backward(
     features: Tensor,
 ) -> None:
     samples, _, channels = features.shape
+    # With one pose an entry holds the slopes of all samples' features.
     per_entry = _native.MOMENTS + (samples * channels if plan.num_poses == 1 else channels)
     check_memory(len(plan.buffers.entries), features.element_size() * per_entry)
     grads, *rest = out

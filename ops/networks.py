@@ -35,6 +35,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
     if fits and encoded.is_cuda:
         fits = encoded.dtype == torch.float32
+        # The CUDA kernel has room for so many inputs and outputs.
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
         backends.named(encoded.device.type)  # loads its kernels

@@ -178,6 +178,7 @@ def composite_gradient(
     *parts: Tensor,
 ) -> tuple[Tensor | None, ...]:
     """Return gradients of means2d, features and `parts`, given those of image and transmittance."""
+    # Kernels always read a slope of the image, one of the transmittance where there is one.
     gaussians, slope = Gaussians(*parts), torch.zeros_like(image) if grad_image is None else grad_image
     out = empty_like(gaussians), features.new_empty(features.shape), means2d.new_empty(means2d.shape)
     values = slope, grad_transmittance, image, transmittance, features

@@ -43,6 +43,7 @@ def array_spectrum(
     sizes += [(0, 0)] * (2 - len(sizes))
     height, columns = square.shape[0], rest[1].shape[1]
     image, unknown = places.new_empty(len(places), *square.shape), places.new_empty(len(places))
+    # Only planar arrays have the second pair of tables.
     absent = (None,) * (4 - len(rest))
     inputs = contiguous((places, *features, *read_out, pairs, *rest))
     calls.run(
@@ -78,4 +79,5 @@ def nearest_weights(
     sizes = (*queries.shape, rows.shape[1])
     numbers = (*two, float(len(lengths)))
     failed = calls.run("nearest_weights", queries, *inputs, weights, known, sizes=sizes, numbers=numbers)
+    # -1 where every covariance has a factor.
     return None if failed >= 0 else (weights, known)

@@ -89,6 +89,7 @@ def project(
     forward = torch.tensor([1.0, 0.0], dtype=means.dtype, device=means.device)
     cos_sin = torch.where(on_axis, forward, sides / torch.where(on_axis, 1.0, length))
     zero = torch.zeros_like(horizontal)
+    # Unit vectors along growing azimuth and growing elevation.
     east = torch.stack([-cos_sin[:, 1], cos_sin[:, 0], zero], -1)
     north = torch.stack([-n[:, 2] * cos_sin[:, 0], -n[:, 2] * cos_sin[:, 1], horizontal], -1)
     elevation = torch.atan2(n[:, 2], horizontal)
@@ -102,6 +103,7 @@ def project(
     axes = pose.rotation.mT @ rotation_matrices(quats)
     angular = scales / distance[:, None]
     columns = axes * angular[:, None, :]
+    # Rows of the square root V of the footprint's covariance, K2 = V V^T.
     v1 = to_column[:, None] * torch.einsum("nk,nki->ni", east, columns)
     v2 = to_row * torch.einsum("nk,nki->ni", north, columns)
     k11, k12, k22 = (v1 * v1).sum(-1), (v1 * v2).sum(-1), (v2 * v2).sum(-1)

@@ -35,6 +35,7 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 
 def _in_rows(plan: Plan) -> Iterator[Plan]:
     """The plan as the reference's, for stretches of rows that bound the memory."""
+    # Of a kernel's plan the third buffer is `Buffers.order`.
     order = plan.buffers[0] if plan.backend == "reference" else plan.buffers[2].long()
     grid, count = plan.grid, max(1, ELEMENTS // max(1, plan.num_gaussians * plan.grid.width))
     for first in range(0, grid.height, count):

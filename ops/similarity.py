@@ -64,6 +64,7 @@ def _cuda(
     if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
         most = 2 * known.MOST_RADIUS + 1
         raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
+    # Only windows that lie inside the image count.
     rows, columns = height - 2 * radius, width - 2 * radius
     blocks = -(-rows // known.SIMILARITY_HEIGHT) * -(-columns // known.SIMILARITY_WIDTH)
     # A sum for each block of pixels, added up in a fixed order below.

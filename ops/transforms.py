@@ -37,6 +37,7 @@ def carries_tangent(*values: Any) -> bool:
 def mapped(*values: Any) -> bool:
     """Tell whether `torch.vmap` has hidden an axis of a tensor among `values`."""
     for value in values if transforming() else ():
+        # Transforms wrap each other's tensors: every layer is looked at.
         while isinstance(value, Tensor) and _functorch.is_functorch_wrapped_tensor(value):
             if _functorch.is_batchedtensor(value):
                 return True

@@ -41,6 +41,7 @@ def gaussians(
     ids: Tensor | None,
 ) -> Gaussians:
     """Return Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
+    # A tensor without axes has no length; its shape is refused below.
     n = means.shape[0] if means.dim() else 0
     result = Gaussians(means, quats, scales, opacities, extinctions)
     expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
@@ -77,6 +78,7 @@ def finite(gaussians: Gaussians, pose: Pose) -> None:
     if not bool((_wrongness(pose) <= 1).all()):  # NaN is not either
         raise_for_pose(pose)
     means, quats, scales, strongest, _ = gaussians
+    # NaN fails every comparison, so that these find it too.
     valid = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
