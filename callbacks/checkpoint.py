@@ -28,6 +28,7 @@ class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after a
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write when the schedule says so."""
         step = module.global_step
+        # After the last step the state is written in any case, and not here.
         due = step and step % in_steps(self.interval, module.total_steps) == 0 and step < module.total_steps
         if due and stands(trainer):
             trainer.save_checkpoint(module.run_dir / "last.ckpt")

@@ -122,6 +122,7 @@ class Paths:
         tones = np.atleast_1d(np.asarray(frequency_hz, np.float64))
         turns = ((tone - self.reference_hz) * self.delay_s for tone in tones)
         summed = [(self.gain * np.exp(-2j * np.pi * turn)).sum(axis=-1) for turn in turns]
+        # By Friis a path's amplitude is proportional to the wavelength.
         return (np.stack(summed, axis=-1) * self.reference_hz / tones).astype(np.complex64)
 
 
@@ -149,6 +150,7 @@ def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     query = _heard(method, site, uplink)
     assert query.uplink is not None and site.uplink_hz is not None
     sources = _separator(method).sources(query.uplink)
+    # Delays of sources are in turns per tone: over the spacing they are seconds.
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
     return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())

@@ -47,6 +47,7 @@ def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, 
     scores = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
     # A silent row has no relative error: any miss of it counts as huge.
     error = (miss / power.clamp_min(1e-30)).double().numpy()
+    # Scores with a NaN rank nothing.
     return error, {kind: score for kind, score in scores.items() if not np.isnan(score).any()}
 
 

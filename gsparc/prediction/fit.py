@@ -68,6 +68,7 @@ def fit(
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
+        # All problems at once, each of them once.
         raise DataError("; ".join(dict.fromkeys(refused.problems))) from None
     data = allowed(reading.data, align)
     for note in reading.notes:

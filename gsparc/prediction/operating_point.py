@@ -82,6 +82,7 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     points, measured = stored_points(stored.extra)
     advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
     if not points:
+        # A model that was never swept has one point, itself.
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
     # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]

@@ -127,6 +127,7 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[n
     if wanted is not None and only is None:
         raise DataError(f"station={wanted}: no such station{suggest(wanted, names)}")
     if queries.station is None:
+        # Each row about every station, those of one row side by side.
         every = np.arange(len(names)) if only is None else np.array([only])
         return np.repeat(rows, len(every)), np.tile(every, len(rows))
     numbers = {

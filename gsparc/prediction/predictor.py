@@ -80,6 +80,7 @@ class Predictor:
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
     def __repr__(self) -> str:
+        # Boxes are in local coordinates, users read the world's.
         low, high = (self.site.box + self.site.origin).round(2).tolist()
         return (
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
@@ -173,6 +174,7 @@ class Predictor:
             return self.site.power_unit(unit or self._unit)
         if unit or self._unit:
             raise ValueError(f"unit={unit or self._unit}: goes with powers, not with {self.site.kind}")
+        # Other kinds have no unit of powers: physical values are stored ones times the scale.
         return PowerUnit("1", False, self.site.target_scale)
 
     def predict(
@@ -224,6 +226,7 @@ class Predictor:
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float()
+            # As many axes as the answers have, so that both broadcast.
             spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
             return _returned(spread, single, as_torch)
 
@@ -440,6 +443,7 @@ class Predictor:
             raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
         query, single, _ = self._query(tx, rx, torch.float64)
         origin = torch.from_numpy(np.asarray(self.site.origin, np.float64))
+        # The origin goes in float64: in UTM coordinates float32 has no centimetres.
         local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
         at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
         with suited_threads(method, len(query)):

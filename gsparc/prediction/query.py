@@ -50,6 +50,7 @@ class Queries:
             sender = _float(np.atleast_2d(places[moving] - self.site.origin))
             return Asked(Query(sender, self._still), single, isinstance(tx, Tensor))
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
+        # One place of an end goes with any number of the other's.
         count = max(len(place) for place in local.values())
         for end, place in local.items():
             if len(place) not in (1, count):

@@ -70,6 +70,7 @@ def interleaved(
     settings = settings or ClockSettings()
     before = torch.get_num_threads()
     threads = threads or dict.fromkeys(contenders, before)
+    # Within a round the number of threads then changes as seldom as can be.
     order = sorted(contenders, key=threads.__getitem__)
     for call in contenders.values():
         for warm in range(settings.warmup):

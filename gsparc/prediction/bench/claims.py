@@ -96,6 +96,7 @@ def claims(
         queries = {"moving": kernels.moving(middle, 1), "one": kernels.frozen(middle, 1)}
         queries["many"] = kernels.frozen(middle, batch)
         times = _times({name: _whole(case) for name, case in queries.items()}, clock)
+        # A batch answers as many queries as it has samples.
         each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
         results.append(Claim(f"moving / frozen at {size}", each, 3.0, True))
         results.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))

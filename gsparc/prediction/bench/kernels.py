@@ -17,6 +17,7 @@ DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference
 
 def moving(scene: Scene, batch: int) -> Case:
     """Time a query of a moving receiver: rasterize, as the model does (kernel); emission too (whole)."""
+    # The same places in another order and moved, so that no two ends are at one place.
     poses, tx = receivers(batch), places(batch).flip(0) + 1
     features = scene.features.expand(batch, -1, -1)
 
