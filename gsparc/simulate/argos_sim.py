@@ -108,11 +108,13 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
         ValueError: fewer than `count` users are decoded.
     """
     streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
+    # Many more than wanted: some are in buildings, some too weak to be decoded.
     across = rng.uniform(LOWER, UPPER, (8 * count, 2))
     across = across[streets.open(across)][: 2 * count]
     users = np.column_stack([across, rng.uniform(*HEIGHT_M, len(across))])
     rays = trace(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
+    # Half of the users are heard better than MEDIAN_SNR_DB.
     noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)
     decoded = np.flatnonzero(power > noise * 10 ** (DECODED_DB / 10))[:count]
     if len(decoded) < count:
@@ -128,6 +130,7 @@ def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
     phase = offsets.phase * rng.uniform(0, 2 * np.pi, count)
     timing = offsets.timing_s * rng.uniform(-1, 1, count)
     drift = offsets.frequency * rng.uniform(-1, 1, count)
+    # The training symbol: what leaks from tone to tone carries its signs.
     pilot = rng.choice([-1.0, 1.0], len(TONES))
     measured = np.empty_like(clean)
     for some in np.array_split(np.arange(count), max(1, count // CHUNK)):

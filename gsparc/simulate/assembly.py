@@ -51,6 +51,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
     strongest = np.zeros(len(paths))
     # Unbuffered, as a receiver owns many paths.
     np.maximum.at(strongest, paths.owner, paths.power)
+    # Only what is within `weakest_db` of a receiver's strongest path goes into the file.
     stored = paths.select(paths.power >= strongest[paths.owner] * 10 ** (-campaign.weakest_db / 10))
     return {
         "spectrum": np.round(images * 255).astype(np.uint8),

@@ -56,6 +56,7 @@ class Deliverable:
         number = float(match[2] or DEFAULTS[kind])
         if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
+        # A skill of 0.9 is an error of 0.1; rounded, since 1 - 0.9 is not 0.1 in binary.
         tolerance = {"coverage": abs(number), "csi": -abs(number), "spectrum": round(1 - number, 6)}[kind]
         return Deliverable(kind, tolerance, quantile)
 
@@ -166,6 +167,7 @@ class Probe:
             return 10 * np.log10(np.maximum(self.nmse(remaining), least))
         full, near = self._images
         rest = remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
+        # With nothing left out the image is there already.
         image = full if remaining == self.effects else self._render(rest)
         error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
         return error / np.maximum(nearest, 1e-12)

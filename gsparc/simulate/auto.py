@@ -205,6 +205,7 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
+        # Rows are named after an effect, or `depth > N`.
         kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, effect))
         table.append(replace(row, kept=kept))
     return Choice(chosen, str(required), tuple(table), len(probe.reached))

@@ -239,6 +239,7 @@ def calibrate(
         away = (x - centre) / deviation
         # Of a row: the search begins with a step as long as the gradient.
         value = (value + 0.5 * float(away @ away)) / len(traced)
+        # Out of looks, the search need not end at the best point that it saw.
         if value < best[0]:
             best = (value, x.copy(), gain, scale)
         return value, (by_material + away / deviation) / len(traced)

@@ -80,6 +80,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     laps.append(time.perf_counter())
     error = convergence(campaign, survey, effects, shards, left_out)
     laps.append(time.perf_counter())
+    # Seconds of all but the shards, which keep their own over interruptions.
     other_s = laps[1] - laps[0] + (0.0 if choice is None else choice.seconds) + laps[4] - laps[3]
     dataset = assemble(campaign, survey, effects, choice, error, other_s, shards)
     laps.append(time.perf_counter())

@@ -64,6 +64,7 @@ def convergence(
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     twice = np.stack([power, again.received_power()])
+    # Only receivers that both seeds reach have levels to compare.
     apart = np.abs(np.diff(10 * np.log10(twice[:, (twice > 0).all(0)]), axis=0))
     return Convergence(
         nmse=float((np.abs(csi - other) ** 2).sum() / energy),

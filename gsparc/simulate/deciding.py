@@ -251,6 +251,7 @@ class Decider:
         campaign, survey, nearest = self.campaign, traced.survey, None
         if self.settings.required.kind == "spectrum":
             owner, place = np.divmod(rows, len(survey.places))
+            # The nearest other place, with the same transmitter.
             nearest = traced.paths(owner * len(survey.places) + neighbours(survey.places, place))
         wavelength, frequency = survey.engine.wavelength, campaign.scene.frequency_hz
         array = campaign.csi.elements(wavelength)

@@ -72,6 +72,7 @@ def fault(library: Path) -> str | None:
     solve = [sys.executable, "-c", TINY_SOLVE]
     tried = subprocess.run(solve, env=environment, capture_output=True, text=True, timeout=300)
     lines = tried.stderr.strip().splitlines() or ["no message"]
+    # The line that names LLVM says most; else the last one.
     words = next((line for line in lines if "LLVM" in line), lines[-1]).strip()
     if tried.returncode == 0:
         with whole_file(seal) as partial:
@@ -84,6 +85,7 @@ def fault(library: Path) -> str | None:
 def _seal(library: Path) -> Path:
     """An empty file that is there once a solve worked with this library and these versions of the solver."""
     stat = library.stat()
+    # Another library, solver or interpreter is tried anew.
     parts = [str(library.resolve()), stat.st_mtime_ns, stat.st_size, sys.executable]
     for name in ("sionna-rt", "mitsuba", "drjit"):
         with suppress(PackageNotFoundError):

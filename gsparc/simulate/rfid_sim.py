@@ -75,6 +75,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
         matrix = steering(planar_array(), grid, WAVELENGTH).numpy().astype(np.complex64)
         for i, vector in enumerate(vectors):
             image = np.abs(vector.astype(np.complex64) @ matrix.conj()).reshape(HEIGHT, WIDTH)
+            # Each image by its own largest value, as in the release.
             grey = np.round(255 * image / image.max()).astype(np.uint8)
             Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
         np.savetxt(partial / "tx_pos.csv", positions, fmt="%.4f", delimiter=",", header="x,y,z", comments="")

@@ -88,6 +88,7 @@ class Shards:
                 shard = self.get(number, *names)
                 parts.append((stored[mine], *(shard[name][mine] for name in names)))
         stored, *arrays = (np.concatenate(one) for one in zip(*parts, strict=True))
+        # From the order of shards to the order asked for.
         at = np.argsort(stored)
         at = at[np.searchsorted(stored[at], rows)]
         return [one[at] for one in arrays]

@@ -153,6 +153,7 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
         for place, sign in ((low, -1.0), (high, 1.0))
     ]
     for sequence in (*permutations(range(len(walls)), 1), *permutations(range(len(walls)), 2)):
+        # The base in the first wall, that image in the next, and so on.
         images = [base]
         for i in sequence:
             axis, coordinate = walls[i][:2]
@@ -164,6 +165,7 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
             continue
         users, target = np.arange(len(flat)), flat
         points: list[np.ndarray] = []
+        # Back from the user: where the line to each image meets its wall.
         for i, image in zip(reversed(sequence), reversed(images), strict=False):
             axis, coordinate, low, high, sign, _ = walls[i]
             front = sign * (target[:, axis] - coordinate) > 0

@@ -140,6 +140,7 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
         layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, ground, streets,
         georeference,
     )  # fmt: skip
+    # Copies that share the scene, which is loaded once.
     engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
 

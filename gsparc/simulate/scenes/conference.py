@@ -45,6 +45,7 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
             base = start + cuts[i] * along + depths[i] * inwards
             name = f"wall{w}_{i}"
             solids.append(sheet(name, material, base, (cuts[i + 1] - cuts[i]) * along, (0, 0, z)))
+            # The gap between panels of different depth is closed.
             if i and depths[i] != depths[i - 1]:
                 edge = start + cuts[i] * along + depths[i - 1] * inwards
                 step = (depths[i] - depths[i - 1]) * inwards

@@ -198,6 +198,7 @@ def _extruded(shape: Any, low: float, high: float, origin: Georeference) -> Any:
         return None
     meshes = [trimesh.creation.extrude_polygon(p, high - low, engine="earcut") for p in parts]
     mesh = trimesh.util.concatenate(meshes)
+    # Extruded from 0: what begins above the ground is lifted there.
     mesh.apply_translation([0, 0, low])
     return mesh
 
