@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning.pytorch as L
 import torch
@@ -40,6 +40,7 @@ class Densify(Checked, L.Callback):
         min_gaussians: pruning stops at this many, the most opaque stay.
     """
 
+    edits_gaussians: ClassVar = True
     start: int | float = setting(500, STEPS)
     stop: int | float = setting(15_000, STEPS)
     interval: int | float = setting(100, INTERVAL)

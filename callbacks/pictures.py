@@ -42,7 +42,7 @@ class Pictures(Checked, L.Callback):
         rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
         with CostLedger.paused_in(trainer), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
-            predicted = module.model(batch.tx, batch.rx).mean
+            predicted = module.mean(batch)
             seconds = CostLedger.seconds_in(trainer)
             title = f"validation, step {step}" + ("" if seconds is None else f", {seconds:.0f} s of training")
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"

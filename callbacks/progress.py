@@ -46,7 +46,8 @@ class StepProgress(L.Callback):
         if trainer.global_step % 20 == 0 or step == total:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in result.items() if value is not None]
-            self._bar.update(task, figures=", ".join([*figures, f"{module.count} Gaussians"]))
+            figures += [] if module.count is None else [f"{module.count} Gaussians"]
+            self._bar.update(task, figures=", ".join(figures))
 
     def on_train_end(self, *unused: Any, **named: Any) -> None:
         """Leave the bar as it is on the screen; also after an error."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning.pytorch as L
 import torch
@@ -32,6 +32,7 @@ class OpacityReset(Checked, L.Callback):
         least_steps: of a training that has resets: of 400 steps one costs 14 dB and half the steps.
     """
 
+    edits_gaussians: ClassVar = True
     interval: int | float = setting(3000, INTERVAL)
     stop: int | float = setting(15_000, STEPS)
     ceiling: float = setting(0.01, SHARE)

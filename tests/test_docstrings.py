@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import doctest
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import gsparc
-import gsparc.apps.locate
-import gsparc.apps.maps
 
 RNG = np.random.default_rng(0)
 PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.5)]
 ENDS = np.array([[4.0, 4.0, 2.6], [9.0, 9.0, 2.6]])
 POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
-PUBLIC = {name: getattr(gsparc, name) for name in gsparc.__all__}
-APPS = {name: getattr(gsparc.apps.maps, name) for name in ("map_of", "plan_next")}
-APPS |= {"locate": gsparc.apps.locate.locate}
+WHERE = dict.fromkeys(gsparc.__all__, "gsparc")
+if Path(gsparc.__file__).with_name("apps").is_dir():  # the core may stand alone
+    WHERE |= {"map_of": "gsparc.apps.maps", "plan_next": "gsparc.apps.maps", "locate": "gsparc.apps.locate"}
 
 
 @pytest.fixture(scope="module")
@@ -39,21 +39,14 @@ def examples(of: object, name: str) -> list[doctest.DocTest]:
     return [test for test in found if test.examples]
 
 
-@pytest.mark.parametrize("name", PUBLIC | APPS)
+@pytest.mark.parametrize("name", WHERE)
 def test_examples_of_docstrings_run(name, checkpoints, monkeypatch):
     monkeypatch.chdir(checkpoints)
-    known = (
-        PUBLIC
-        | APPS
-        | {
-            "gsparc": gsparc,
-            "torch": torch,
-            "predictor": gsparc.load("model.ckpt"),
-            "places": PLACES,
-            "powers_dbm": POWERS[:, 0],
-        }
-    )
-    tests = examples((PUBLIC | APPS)[name], name)
+    of = getattr(import_module(WHERE[name]), name)
+    known = {"gsparc": gsparc, "torch": torch, "predictor": gsparc.load("model.ckpt"), "places": PLACES}
+    known |= {one: getattr(gsparc, one) for one in gsparc.__all__}
+    known |= {name: of, "powers_dbm": POWERS[:, 0]}
+    tests = examples(of, name)
     assert tests, f"{name} has no example"
     report: list[str] = []
     for test in tests:

@@ -175,6 +175,21 @@ def test_strings_are_followed():
     assert ("evaluation", "conf") in arrows(), "the configuration is named in a string alone"
 
 
+def test_the_core_does_without_the_apps():
+    """What is done with predictions is known to the commands alone, also in functions and strings."""
+    above = [ROOT / "gsparc" / name for name in ("apps", "commands")]
+    rooms = [ROOT / name for name in ("gsparc", "ops", "callbacks", "bench", "hydra_plugins")]
+    core = [file for room in rooms for file in room.rglob("*.py") if not {*above} & {*file.parents}]
+    assert len(core) > 300
+    wrong = {file for file in core for name in (*_imports(file), *named(_tree(file))) if _is_app(name)}
+    wrong |= {file for file in (ROOT / "conf").rglob("*.yaml") if "gsparc.apps" in file.read_text("utf-8")}
+    assert not wrong
+
+
+def _is_app(name: str) -> bool:
+    return (name + ".").startswith("gsparc.apps.")
+
+
 def test_few_modules_lie_beside_the_rooms():
     assert {file.name for file in (ROOT / "gsparc").glob("*.py")} == {"__init__.py", "__main__.py"}
 

@@ -11,17 +11,10 @@ from rich.table import Table
 
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.evaluation.calibration import (
-    NAMES,
-    collect,
-    draw_calibration,
-    figures,
-    store,
-    too_few,
-    trials,
-)
+from gsparc.evaluation.open_runs import collect, store
+from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.prediction.risk_threshold import Guarantee
+from gsparc.prediction.risk import Guarantee, figures, too_few, trials
 from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,6 @@ import pandas as pd
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.locate import locate
 from gsparc.commands.shared.output import finish, run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, plain
@@ -53,6 +52,8 @@ def task(config: DictConfig) -> pd.DataFrame:
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, bool(settings["train"]), limit_s)
         if locating:
+            from gsparc.commands.locate import locate  # here: the core compares without the apps
+
             errors = compare_places(filled, settings["locate"], cells_dir, locate)
             write_samples(run_dir / "places.csv", {name: errors[name].tolist() for name in errors})
             finish(run_dir, *facts_and_table(errors))

@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.data.blocks import blocks, contents
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
-from gsparc.data.schema import Links, Measurements, Site
+from gsparc.data.schema import Links, Measurements, Site, TrainTest
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
@@ -51,9 +51,8 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     for part in blocks(values):
         rows = values[part][usual[part]]
         # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
-        magnitude = (
-            np.abs(rows if weight is None else rows[weight[part][usual[part]]]).astype(np.float64) / peak
-        )
+        rows = rows if weight is None else rows[weight[part][usual[part]]]
+        magnitude = np.abs(rows).astype(np.float64) / peak
         total, count = total + float((magnitude**2).sum()), count + magnitude.size
     return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
 
@@ -104,7 +103,7 @@ def assemble(
     noise_variance: np.ndarray | None = None,
     directions: list[np.ndarray] | None = None,
     row_names: list[str] | None = None,
-    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    release_split: TrainTest | None = None,
     provenance: Mapping[str, str] | None = None,
     array: np.ndarray | None = None,
     carrier_hz: float | None = None,

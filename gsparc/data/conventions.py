@@ -52,9 +52,8 @@ class Signals:
 
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Signals:
         """The same with entries of values and mask elsewhere."""
-        return replace(
-            self, values=change(self.values), mask=None if self.mask is None else change(self.mask)
-        )
+        mask = None if self.mask is None else change(self.mask)
+        return replace(self, values=change(self.values), mask=mask)
 
     def rows(self, part: slice | np.ndarray) -> Signals:
         """Some of the rows."""
@@ -87,21 +86,22 @@ class Convention:
     tried: bool
 
 
-def _values(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Signals], Signals]:
+Change = Callable[[Signals], Signals]
+
+
+def _values(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda signals: replace(signals, values=change(signals.values))
 
 
-def _moved(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Signals], Signals]:
+def _moved(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return lambda signals: signals.moved(change)
 
 
-def _array(factor: Callable[[Signals], float]) -> Callable[[Signals], Signals]:
+def _array(factor: Callable[[Signals], float]) -> Change:
     return lambda signals: replace(signals, array=np.asarray(signals.array) * factor(signals))
 
 
-def _grid(
-    first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0
-) -> Callable[[Signals], Signals]:
+def _grid(first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0) -> Change:
     """The first elevation and azimuth changed, one axis reversed."""
 
     def turned(signals: Signals) -> Signals:
@@ -152,7 +152,11 @@ def _last(grid: SphereGrid) -> tuple[float, float]:
     return elevation, grid.first_azimuth + (grid.width - 1) * grid.azimuth_step
 
 
-def _azimuth(turn: float) -> Callable[[Signals], Signals]:
+def _from_zenith(grid: SphereGrid) -> tuple[float, float]:
+    return math.pi / 2 - _last(grid)[0], grid.first_azimuth
+
+
+def _azimuth(turn: float) -> Change:
     return _grid(lambda grid: (grid.first_elevation, grid.first_azimuth + turn))
 
 
@@ -204,11 +208,7 @@ _ROWS: dict[str, tuple[str, Callable[[Signals], Signals], Callable[[Signals], bo
     "delays_removed": ("the delay of each row taken out", _with_delays, _tones),
     "zeros_unmeasured": ("0 for tones that were not measured", _without_zeros, _tones),
     "transposed": ("rows as azimuths, columns as elevations", _transposed, _hemisphere),
-    "zenith": (
-        "elevation from the zenith",
-        _grid(lambda g: (math.pi / 2 - _last(g)[0], g.first_azimuth), 1),
-        _above,
-    ),
+    "zenith": ("elevation from the zenith", _grid(_from_zenith, 1), _above),
     "clockwise": ("clockwise azimuth", _grid(lambda g: (g.first_elevation, -_last(g)[1]), 2), _sphere),
     "azimuth_180": ("azimuth from -180 degrees", _azimuth(-math.pi), _sphere),
     "azimuth_north": ("azimuth from the y axis", _azimuth(math.pi / 2), _sphere),
@@ -230,9 +230,8 @@ def mended(signals: Signals, names: Iterable[str]) -> Signals:
     for name in [name for name in CONVENTIONS if name in chosen]:
         one = CONVENTIONS[name]
         if not one.applies(signals):
-            raise DataError(
-                f"dataset.{name}: {one.words}: cannot be of rows of shape {signals.values.shape[1:]}"
-            )
+            shape = signals.values.shape[1:]
+            raise DataError(f"dataset.{name}: {one.words}: cannot be of rows of shape {shape}")
         signals = _in_blocks(signals, one.change) if is_big(signals.values) else one.change(signals)
     return signals
 

@@ -165,10 +165,8 @@ class DataModule(pl.LightningDataModule, ABC):
         """Training batches, starting where the trainer stands (also in the middle of an epoch)."""
         trainer = self.trainer
         rank, devices = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
-        pool = self._rows().train
-        return StepLoader(
-            self.measurements, pool, self.batch_size, self.seed, self._batches_shown, rank, devices
-        )
+        how = self._rows().train, self.batch_size, self.seed, self._batches_shown, rank, devices
+        return StepLoader(self.measurements, *how)
 
     def val_dataloader(self) -> RowsLoader:
         """Validation rows in order, all of them on every device."""

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib.resources import files
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,12 @@ def read_csv(path: Path, missing: str) -> list[list[str]]:
         return list(csv.reader(map(partial(checked_line, path), count(1), io.StringIO(text))))
     except csv.Error as error:
         raise DataError(f"{path}: not readable as CSV text ({error})") from None
+
+
+def shipped(package: str, name: str) -> list[dict[str, str]]:
+    """Rows of a table in CSV that a package brings, by its heads."""
+    text = files(package).joinpath(name).read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
 
 
 def checked_line(path: str | Path, number: int, line: str) -> str:

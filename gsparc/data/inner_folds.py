@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 
 from gsparc.data import splits
 from gsparc.data.errors import DataError
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import CORNERS, FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.schema import Measurements, TrainTest
+from gsparc.data.splits import CORNERS, AnySplit, FileSettings, Fold, SplitSettings, make_split
 
+Draws = np.random.Generator
 FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
 SIDES = np.sqrt(2) ** np.arange(9)  # of squares tried for a file's gap, in units of that gap
 HALVINGS = 6  # of the side of squares, where too few squares hold training rows
@@ -44,7 +45,7 @@ class InnerFolds:
 def inner_folds(
     positions: np.ndarray,
     fold: Fold,
-    split: SplitSettings | FileSettings | None,
+    split: AnySplit | None,
     count: int,
     seed: int,
     place: np.ndarray | None = None,
@@ -97,9 +98,7 @@ def inner_folds(
     return InnerFolds(cut.name, folds, units)
 
 
-def cut_inside(
-    data: Measurements, fold: Fold, split: SplitSettings | FileSettings | None, count: int, seed: int
-) -> InnerFolds:
+def cut_inside(data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int) -> InnerFolds:
     """`inner_folds` of measurements.
 
     Where both ends are taken for moving only because stations are learned together, what moves is the other
@@ -118,7 +117,7 @@ def _still(places: np.ndarray, station: np.ndarray) -> bool:
     return bool(np.allclose(places, places[first][which.reshape(-1)]))
 
 
-def _inside(positions: np.ndarray, fold: Fold, split: SplitSettings | FileSettings | None) -> SplitSettings:
+def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitSettings:
     """The settings that cut inside what a split left: nothing is thinned or left out again."""
     if split is None:
         return SplitSettings()
@@ -164,7 +163,7 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
     return best
 
 
-def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator) -> InnerFolds:
+def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds:
     """Folds of places (P, D), as the settings say or the nearest that is possible."""
     if settings.name == "blocks":
         side = settings.side_m or 0.0
@@ -184,21 +183,16 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.
             cut = [f for corner in corners for f in make_split(where, replace(settings, corner=corner)).folds]
             chosen = rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
             unit = np.full(len(where), NOT_TESTED)
-            for number, i in reversed(
-                list(enumerate(chosen))
-            ):  # a row of two folds is counted with the first
+            for number, i in reversed([*enumerate(chosen)]):  # a row of two folds is counted with the first
                 unit[cut[i].test] = number
             return InnerFolds(settings.name, tuple(cut[i] for i in chosen), unit)
     settings = replace(settings, name="random")
-    folds = tuple(
-        make_split(where, settings, pair).folds[0] for pair in _pieces(len(where), settings, count, rng)
-    )
+    pieces = _pieces(len(where), settings, count, rng)
+    folds = tuple(make_split(where, settings, pair).folds[0] for pair in pieces)
     return InnerFolds("random", folds, np.arange(len(where)))
 
 
-def _pieces(
-    places: int, settings: SplitSettings, count: int, rng: np.random.Generator
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _pieces(places: int, settings: SplitSettings, count: int, rng: Draws) -> Iterator[TrainTest]:
     """(training, test) places of each fold: pieces of one permutation, overlapping only where they must."""
     order = rng.permutation(places)
     size = min(max(round(settings.test_fraction * places), 1), places - 1)
@@ -211,7 +205,7 @@ def _draws(
     where: np.ndarray,
     settings: SplitSettings,
     count: int,
-    rng: np.random.Generator,
+    rng: Draws,
     station: np.ndarray | None = None,
 ) -> tuple[Fold, ...]:
     """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
@@ -226,9 +220,7 @@ def _draws(
     return tuple(chosen)
 
 
-def _stations(
-    station: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator
-) -> InnerFolds | None:
+def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds | None:
     """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
     number, name = int(station.max()) + 1, settings.name
     together = settings.leave_out if isinstance(settings.leave_out, int) else 0

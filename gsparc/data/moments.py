@@ -48,16 +48,8 @@ class Snapshots:
         tones = np.asarray(tones, float) if known else np.zeros(target.shape[2])
         run = np.zeros(len(first), np.int64) if data.run is None else data.run[rows[first]]
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
-        one = cls(
-            rows,
-            moment,
-            column * target.shape[1],
-            names,
-            data.moving[rows[first]],
-            empty,
-            tones - tones.mean(),
-            run,
-        )
+        antenna, places = column * target.shape[1], data.moving[rows[first]]
+        one = cls(rows, moment, antenna, names, places, empty, tones - tones.mean(), run)
         return replace(one, values=one.arranged(target))
 
     def arranged(self, rows: np.ndarray) -> np.ndarray:

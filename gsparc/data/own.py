@@ -1,6 +1,6 @@
 """Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
 
-docs/reference/schema.md documents it; `fields.py` is its table. `interpret` turns arrays into measurements
+docs/reference/schema.md documents it; fields.csv is its table. `interpret` turns arrays into measurements
 or lists everything that is wrong, `load_own` is its strict form, `write_own` refuses what `load_own` would.
 """
 
@@ -32,6 +32,7 @@ SHAPES: dict[str, tuple[tuple[None, ...], ...]] = {
     "csi": ((None,), (None, None), (None, None, None)),
     "rssi": ((None,),),
 }
+Arrays = Mapping[str, np.ndarray]
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
@@ -65,9 +66,7 @@ def interpreted(raw: Raw, source: str | Path) -> Measurements:
     return reading.data
 
 
-def write_own(
-    path: str | Path, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any] | None = None
-) -> Measurements:
+def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> Measurements:
     """Write arrays named as in the schema (validated first, atomically) and return them as measurements.
 
     Args:
@@ -86,9 +85,7 @@ def write_own(
     return data
 
 
-def from_arrays(
-    arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any] | None = None
-) -> Measurements:
+def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> Measurements:
     """The same without a file.
 
     Raises:
@@ -117,9 +114,8 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         check.problems.raise_if_any()
     assert measured is not None and links is not None
     raw = check.raw
-    lost = links.unknown_transmitter or (
-        links.stations is not None and np.isnan(links.stations.position).any()
-    )
+    lost = links.stations is not None and np.isnan(links.stations.position).any()
+    lost |= links.unknown_transmitter
     check.unknown = f"{links.static_end}_position" if lost else None
     values, kind = _measured(check, measured)
     if values is None:
@@ -225,9 +221,8 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
     if is_big(array) and kind != "rssi" and len(array) > 1 and "mask" not in check.raw.arrays:
         return array, kind  # its blocks are cast where they are read
-    if (
-        kind == "rssi" or array.dtype.kind in "fc"
-    ):  # magnitudes of complex64 overflow, units of 1e-42 are lost
+    # Magnitudes of complex64 overflow, units of 1e-42 are lost.
+    if kind == "rssi" or array.dtype.kind in "fc":
         array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
     if kind == "rssi":
         array = array[:, None]
@@ -256,6 +251,9 @@ def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
     return values
 
 
+Test = Callable[[np.ndarray], np.ndarray]
+
+
 def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
     """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -273,9 +271,7 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     check.refuse_rows(name, out, f"out of range; expected {wanted}")
 
 
-def _rows(
-    values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
-) -> np.ndarray:
+def _rows(values: np.ndarray, test: Test, mask: np.ndarray | None = None) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
     flags = []
     for part in blocks(values):

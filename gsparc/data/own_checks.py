@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL
+from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
 
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
@@ -87,9 +87,8 @@ class Checker:
         array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
         if array is None:
             return None
-        if array.dtype.kind not in kinds or (
-            kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
-        ):
+        wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
+        if array.dtype.kind not in kinds or wide:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
         return array if self.fits(name, array, *shapes) else None
 
@@ -167,10 +166,8 @@ class Checker:
             if values is None:
                 continue
             if values.size == 0 or not np.all((values >= LOWEST_HZ) & (values <= HIGHEST_HZ)):
-                fault = (
-                    f"{np.array2string(values, threshold=4)} is outside {LOWEST_HZ:.0e} to {HIGHEST_HZ:.0e}"
-                )
-                self.refuse(name, f"{fault}; expected Hz (not MHz or GHz)")
+                fault = f"{np.array2string(values, threshold=4)} is outside {LOWEST_HZ:.0e} to"
+                self.refuse(name, f"{fault} {HIGHEST_HZ:.0e}; expected Hz (not MHz or GHz)")
                 return None, None
             if len(np.unique(values)) != values.size:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
@@ -202,10 +199,8 @@ class Checker:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
         good = is_unit(values)
-        bad = (
-            f"{self.row_names[i]} = {np.array2string(values[i], separator=', ')}"
-            for i in np.flatnonzero(~good)
-        )
+        wrong = np.flatnonzero(~good)
+        bad = (f"{self.row_names[i]} = {np.array2string(values[i], separator=', ')}" for i in wrong)
         where = self.where("rx_orientation")
         self.problems.add_rows(where, bad, "expected a quaternion (w, x, y, z) of length 1")
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
@@ -245,7 +240,7 @@ class Checker:
                 return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
         return offsets.astype(np.int64)
 
-    def release_split(self, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def release_split(self, rows: int) -> TrainTest | None:
         """(train, test) rows that the file names, or None."""
         names = self.given("split_train", "split_test")
         if len(names) == 1:

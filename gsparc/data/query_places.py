@@ -134,11 +134,8 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
-    axes = (
-        f"columns.{end}_x=COLUMN and .{end}_y"
-        if both
-        else "columns.latitude=COLUMN and .longitude, or .x and .y"
-    )
+    axes = "columns.latitude=COLUMN and .longitude, or .x and .y"
+    axes = f"columns.{end}_x=COLUMN and .{end}_y" if both else axes
     return f"{sheet.source}: no coordinates of the {ENDS[end]} among {sheet.first_heads()}; say {axes}"
 
 

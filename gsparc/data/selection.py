@@ -29,6 +29,7 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
 ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
+Arrays = dict[str, np.ndarray]
 
 
 def _listed(value: Any) -> Any:
@@ -181,9 +182,7 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
     return _select(raw, keep, f"dataset.max_rows={max_rows}", source)
 
 
-def take_rows(
-    arrays: Mapping[str, np.ndarray], rows: np.ndarray, count: int, stations: int | None = None
-) -> dict[str, np.ndarray]:
+def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None = None) -> Arrays:
     """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits and paths follow.
 
     Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
@@ -267,10 +266,8 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
-def known_station(
-    wanted: str | int, names: Sequence[str], count: int, option: str, source: str | Path
-) -> int:
-    """`station_number`; the setting `option` is named in errors.
+def known_station(wanted: str | int, names: Sequence[str], count: int, option: str, file: str | Path) -> int:
+    """`station_number`; the setting `option` of a `file` is named in errors.
 
     Raises:
         DataError: there is none.
@@ -279,8 +276,8 @@ def known_station(
     if number is not None:
         return number
     if not names or (isinstance(wanted, int) and not any(name.isdigit() for name in names)):
-        raise DataError(f"{option}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"{option}: no station {wanted} in {source}{suggest(str(wanted), names)}")
+        raise DataError(f"{option}: {file} has stations 0 to {count - 1}")
+    raise DataError(f"{option}: no station {wanted} in {file}{suggest(str(wanted), names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:

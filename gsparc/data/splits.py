@@ -20,6 +20,7 @@ from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import numbered
+from gsparc.data.schema import TrainTest
 
 log = logging.getLogger(__name__)
 
@@ -31,9 +32,8 @@ LEAST_ROWS = 4  # fewer training rows than this teach nothing
 NEAR = 0.01  # of the usual step: places nearer than this are visits of one
 FEWEST_PLACES, SAMPLE = 10, 10_000  # that tell a usual step; more tell nothing more
 # Large odd factors: cells become numbers, which sort much faster than rows.
-MIXING = 2**62 + np.array(
-    [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
-)
+_ODD = [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
+MIXING = 2**62 + np.array(_ODD)
 EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
@@ -85,6 +85,7 @@ def _are_rows(value: Any) -> bool:
     return all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
 
 
+LeaveOut = Sequence[int] | Literal["outliers"]
 ROWS = Limit("outliers, or a list of rows like [3, 17],", _are_rows)
 KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*NAMES, "file"))
 
@@ -129,7 +130,7 @@ class SplitSettings(Checked):
     train_count: int | None = setting(None, or_null(whole(1)))
     thin: float = setting(1.0, number(0, 1, open_low=True))
     spacing_m: float | None = setting(None, or_null(POSITIVE))
-    leave_out: Sequence[int] | Literal["outliers"] | int = ()
+    leave_out: LeaveOut | int = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -148,7 +149,7 @@ class FileSettings(Checked):
 
     name: str = "file"
     path: str = ""
-    leave_out: Sequence[int] | Literal["outliers"] = setting((), ROWS)
+    leave_out: LeaveOut = setting((), ROWS)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,10 +157,13 @@ class FileSettings(Checked):
             raise DataError("split.path is not set; say split.path=split.json for split=file")
 
 
+AnySplit = SplitSettings | FileSettings
+
+
 def make_split(
     positions: np.ndarray,
     settings: SplitSettings,
-    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    release_split: TrainTest | None = None,
     outliers: np.ndarray | None = None,
     place: np.ndarray | None = None,
     station: np.ndarray | None = None,
@@ -199,9 +203,7 @@ def make_split(
     return Split(settings.name, folds, indices_hash(folds))
 
 
-def _pairs(
-    positions: np.ndarray, settings: SplitSettings, named: tuple[np.ndarray, np.ndarray] | None
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
     """(training, test) rows of each fold, before thinning and validation."""
     if named is not None:
         return [named]
@@ -277,9 +279,7 @@ def square_of(floor: np.ndarray, side: float) -> np.ndarray:
     return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def left_out(
-    leave_out: Sequence[int] | Literal["outliers"], outliers: np.ndarray | None, rows: int
-) -> np.ndarray:
+def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
     """The rows (n,) int64 of `rows` that `leave_out` names, where `outliers` (n,) are those of that name.
 
     Raises:
@@ -316,16 +316,16 @@ def path_order(positions: np.ndarray) -> np.ndarray:
     return np.argsort(positions[:, longest], kind="stable")
 
 
-def far_from(
-    positions: np.ndarray, candidates: np.ndarray, others: np.ndarray, distance: float
+def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
+    """Those `rows` that are more than `distance` [m] away from all `others` (rows)."""
+    if len(rows) == 0 or len(others) == 0:
+        return rows
+    return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
+
+
+def far_apart(
+    positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
 ) -> np.ndarray:
-    """Those `candidates` (rows) that are more than `distance` [m] away from all `others` (rows)."""
-    if len(candidates) == 0 or len(others) == 0:
-        return candidates
-    return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
-
-
-def far_apart(positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int]) -> np.ndarray:
     """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
     tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
     subset = []
@@ -390,7 +390,7 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     return Split(name, folds, stored_hash)
 
 
-def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
     """Each fold tests on whole stretches of the path, training rows near them dropped."""
     order = path_order(positions)
     if len(order) < 2 * settings.folds * settings.stretches_per_fold:
@@ -450,16 +450,15 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
     folds = []
     for fold, test in enumerate(test_units):
-        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(
-            np.setdiff1d(np.arange(count), test)
-        )
+        rest = np.setdiff1d(np.arange(count), test)
+        rest = np.random.default_rng([settings.seed, fold, 2]).permutation(rest)
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
         parts = (np.setdiff1d(rest, chosen), chosen, test)
         folds.append(Fold(*(np.flatnonzero(np.isin(unit, part)) for part in parts)))
     return tuple(folds)
 
 
-def _corner(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, np.ndarray]:
+def _corner(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
     """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
     lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
     unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)

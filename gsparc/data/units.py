@@ -9,6 +9,8 @@ from typing import Self
 import numpy as np
 from torch import Tensor
 
+from gsparc.data.files import shipped
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -38,16 +40,8 @@ class Unit:
 
 SCHEMA = {"length": "m", "angle": "deg", "frequency": "Hz", "power": "W", "level": "dBm"}
 _LISTED = [
-    *(Unit(name, "length", factor) for name, factor in (("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("km", 1e3))),
-    *(Unit(name, "length", 0.3048) for name in ("ft", "feet")),
-    *(Unit(name, "length") for name in ("meter", "metre", "meters", "metres")),
-    *(Unit(name, "angle") for name in ("deg", "°", "degree", "degrees")),
-    *(Unit(name, "angle", 180 / np.pi) for name in ("rad", "radians")),
-    *(Unit(n, "frequency", f) for n, f in (("Hz", 1.0), ("kHz", 1e3), ("MHz", 1e6), ("GHz", 1e9))),
-    *(Unit(n, "power", f) for n, f in (("W", 1.0), ("mW", 1e-3), ("uW", 1e-6), ("µW", 1e-6), ("nW", 1e-9))),
-    *(Unit(n, "power", f) for n, f in (("pW", 1e-12), ("fW", 1e-15))),
-    *(Unit("dB", "level"), Unit("dBm", "level"), Unit("dBW", "level", offset=30.0)),
-    *(Unit(name, "quality") for name in ("%", "percent", "pct")),
+    Unit(one["name"], one["kind"], float(one["factor"]), float(one["offset"]))
+    for one in shipped("gsparc.data", "units.csv")
 ]
 # Without case: nobody receives megawatts.
 UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}

@@ -57,9 +57,8 @@ def read_walls(path: str | Path | None) -> SceneWalls:
     elif path.suffix.lower() in (".yaml", ".yml"):
         walls = _table(path, problems)
     else:
-        problems.add(
-            path, "walls are read from *.yaml or *.obj; export meshes of other kinds as Wavefront OBJ"
-        )
+        how = "export meshes of other kinds as Wavefront OBJ"
+        problems.add(path, f"walls are read from *.yaml or *.obj; {how}")
     if not problems and not len(walls):
         problems.add(path, f"no walls in it; expected {EXPECTED}")
     problems.raise_if_any()
@@ -109,9 +108,8 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
     if room.get("boxes_m"):
         corners = finite(room["boxes_m"])
         if corners.shape[1:] != (2, 3) or not (corners[:, 0] < corners[:, 1]).all():
-            problems.add(
-                path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
-            )
+            wanted = "expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
+            problems.add(path, f"room.boxes_m: {wanted}")
         else:
             boxes = corners
     return faces, boxes

@@ -19,10 +19,13 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.scores import rows_of
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
+from gsparc.prediction.confidence import Trusted, gather, keep, known_positions, position_kernel, threshold_of
 from gsparc.prediction.query import SAME_PLACE_M
+from gsparc.prediction.risk import MOST_LAX_DB, Evidence, Guarantee, accept, joined, laxer, too_few
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -308,3 +311,61 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
 def _times(values: Any, factor: float) -> Any:
     """An array in another unit, of the same type."""
     return values if values is None or factor == 1 else (values * factor).astype(values.dtype)
+
+
+def collect(
+    paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
+) -> tuple[Evidence, dict[str, Any]]:
+    """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
+    parts, seen = [], np.zeros(0, np.int64)
+    facts: dict[str, Any] = {}
+    for path in paths:
+        run = _unseen(path, dataset, split)
+        fold = run.split.folds[0]
+        rows = np.setdiff1d(rows_of(fold, "test"), seen)
+        if len(rows):
+            parts.append(gather(run.methods[0], run.data, fold, rows))
+        seen = np.concatenate([seen, rows])
+        facts = facts or run.facts()
+    return joined(parts), facts
+
+
+def store(
+    path: str,
+    dataset: dict[str, Any],
+    split: dict[str, Any],
+    promise: Guarantee,
+    kind: str,
+    spatial: bool,
+    seed: int,
+) -> tuple[Trusted, str]:
+    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
+    run = _unseen(path, dataset, split)
+    method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    evidence = gather(method, data, fold, rows_of(fold, "test"))
+    kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
+    threshold = threshold_of(kind_used, choice)
+    stored = Trusted(kind_used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
+    keep(path, stored)
+    if np.isfinite(threshold):
+        return stored, f"accepted from {threshold:.4g}"
+    if too_few(len(evidence), promise) is not None:
+        return stored, "no threshold keeps the bound"
+    bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
+    other = laxer(evidence, promise, kind, spatial, seed)
+    hint = (
+        f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
+    )
+    return stored, (
+        f"no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse than {limit}, "
+        f"and the others are not told from them surely enough; {hint} kept, more training rows may help"
+    )
+
+
+def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
+    """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
+    run = open_files([path], dataset, split)
+    if run.learned != 0:
+        advice = "calibrate with the data and split of its training"
+        raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
+    return run

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models.method import Method, predictions
+from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded, risk_coverage
 
 SPECTRA = 4  # test rows drawn
 
@@ -107,3 +109,40 @@ def draw_spectra(
     figure.colorbar(error, ax=axes[:, 2], label="difference", **{**below, "aspect": 20})
     figure.suptitle(title)
     save(figure, path, 100)
+
+
+NAMES = {
+    "learned": "learned", "expected": "expected error", "distance": "distance to the nearest",
+    "gp_variance": "GP variance",
+}  # fmt: skip
+
+
+def draw_calibration(
+    evidence: Evidence, trials: Sequence[Trial], promise: Guarantee, title: str, path: Path
+) -> None:
+    """Save risk against coverage, and what came of the draws, as one PNG."""
+    figure, ((left, right),) = panels(11, 4.2, 1, 2)
+    loss = bounded(evidence.error)
+    coverage = np.arange(1, len(loss) + 1) / len(loss)
+    for kind, score in evidence.scores.items():
+        risk = risk_coverage(score, loss)
+        left.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
+    risk = risk_coverage(-loss, loss)
+    left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
+    left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
+    left.set_title(title)
+    for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
+        broken = trial.facts()["broken_of_all"]
+        label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
+        right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
+    # a draw that accepts nobody has no share of bad ones: NaN
+    worst = max(promise.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
+    right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
+    if not any(trial.coverage.any() for trial in trials):
+        right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
+    right.axhline(promise.alpha, color="black", linewidth=1)
+    right.set_title(f"promise: at most {promise.alpha:.0%} bad, broken in at most {promise.delta:.0%}")
+    right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
+    for axis in (left, right):
+        axis.legend(fontsize=8)
+    save(figure, path)

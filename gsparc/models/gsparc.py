@@ -14,8 +14,8 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
-from gsparc.models.closed_forms import Bearings, Channels, ClosedForms, ImageSources, Powers
 from gsparc.models.method import HasPaths, HasProcess, Method, Reconditions
+from gsparc.models.mixture.named import Bearings, Channels, ImageSources, NamedMixture, Powers
 from gsparc.models.refined_places import errors_of
 from gsparc.models.splat.averaged import ImageProcess
 from gsparc.models.splat.method import LearnedField
@@ -48,7 +48,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         plain, hides = switches.residual is not False, switches.visibility
         placed = count > 0 or not plain
         residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
-        table: tuple[tuple[bool, type[ClosedForms] | None], ...] = (
+        table: tuple[tuple[bool, type[NamedMixture] | None], ...] = (
             (site.phase_reference == "neighbours", Channels),
             (terms.power, Powers),
             (terms.moving_array and placed, Bearings),
@@ -120,7 +120,7 @@ class Gsparc(LearnsTogether):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        solved = "solution" in state  # a field in closed form says itself what it is
+        solved = "members" in state  # a field in closed form says itself what it is
         self.site, self.chosen = site, Channels() if solved else self.rendered
         self.chosen.name = self.name
         self.chosen.restore(site, state)
@@ -139,7 +139,8 @@ class Gsparc(LearnsTogether):
     threads_pay = _its("threads_pay")
     gradient_problem = _its("gradient_problem")
     field_alone = _its("field_alone")
-    solution = _its("solution")
+    only = _its("only")
+    parts = _its("parts")
     fitted = _its("fitted")
     steps = _its("steps")
     steps_taken = _its("steps_taken")

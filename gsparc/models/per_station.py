@@ -339,7 +339,7 @@ class OfStations(OfStation):
 
     def joint(self) -> HasJoint | None:
         """What knows how levels of stations go together; None where nothing does."""
-        method = getattr(getattr(self.inner, "solution", None), "only", None)
+        method = getattr(self.inner, "only", None)
         return method if isinstance(method, HasJoint) else None
 
     def predict(self, query: Query) -> Prediction:

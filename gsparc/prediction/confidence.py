@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,33 +18,11 @@ from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.method import Method, Prediction, predictions
 from gsparc.models.target_rows import training_targets
-from gsparc.prediction.risk_threshold import Guarantee, Threshold
+from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, joined
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 
-RIVALS = ("distance", "gp_variance")
-KINDS = ("learned", "expected", *RIVALS)
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Positions a method did not learn from.
-
-    Attributes:
-        row: (n,) rows of the dataset.
-        position: (n, 3) [m].
-        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
-        scores: by kind, (n,) each, larger is surer.
-    """
-
-    row: np.ndarray
-    position: np.ndarray
-    error: np.ndarray
-    scores: dict[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.row)
 
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
@@ -109,15 +87,6 @@ def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> n
     rows = torch.from_numpy(known)
     white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
     return (1 + kernel.noise - white.square().sum(0)).numpy()
-
-
-def joined(parts: Sequence[Evidence]) -> Evidence:
-    """Folds together; scores that not every part has are dropped."""
-    kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
-    scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
-    facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
-    row, position, error = map(np.concatenate, facts)
-    return Evidence(row, position, error, scores)
 
 
 KEY = "confidence"

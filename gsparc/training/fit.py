@@ -24,7 +24,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.training.context import FitContext
-from gsparc.training.module import GaussianModule
+from gsparc.training.module import NetworkModule
 from gsparc.training.pace import SPENT, Budget
 from gsparc.training.processes import Processes
 from gsparc.training.time_budget import Spent, TimeBudget
@@ -93,7 +93,7 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
 class ReturnMetrics(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
-    def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
+    def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
         """Also after a checkpoint with every step done; of an unfinished schedule, what was taken is kept."""
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
@@ -166,7 +166,7 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
 
 def run_stage(
-    module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
+    module: NetworkModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
     budget: TimeBudget, watch: Sequence[L.Callback] = (),
 ) -> Ran:  # fmt: skip
     """Train `module` on `fold.train`, watching `fold.val`.
@@ -190,13 +190,14 @@ def run_stage(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val))]
+    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), module.count is not None)]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
     given = make.keywords.get("val_check_interval")
     every = given if type(given) is int else max(1, module.total_steps // LOOKS)
-    module.log_every = math.gcd(LOG_EVERY, every)  # a validation sees the figures of its own step
+    # A validation sees the figures of its own step.
+    module.log_every = math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
     per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
@@ -208,8 +209,12 @@ def run_stage(
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
-    heeded.count("trainer", "callbacks", "dataset.batch_size")
+    heeded.count("trainer", "callbacks")
     processes = Processes.named(make.keywords.get("strategy"))
+    if module.count is None:  # networks of published methods make tensors of their own, on the CPU
+        if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
+            log.warning("published methods train in one process on the CPU, whatever trainer= says")
+        processes, options = None, {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"}
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
@@ -246,12 +251,12 @@ def run_stage(
     return Ran((budget.counted - before).wall, kept, taken, timed_out)
 
 
-def _told(callbacks: Sequence[L.Callback], rows: int) -> Sequence[L.Callback]:
-    """Without those that look at figures of validation rows, where there are none."""
+def _told(callbacks: Sequence[L.Callback], rows: int, edits: bool) -> Sequence[L.Callback]:
+    """Without those of figures of validation rows, or of Gaussians to edit, where there are none."""
     blind = [] if rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
     if blind:
         log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
-    return [one for one in callbacks if one not in blind]
+    return [c for c in callbacks if c not in blind and (edits or not hasattr(c, "edits_gaussians"))]
 
 
 def _lost(error: ProcessException, advice: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.query import Batch
 from gsparc.field.initial import Snapshot
 from gsparc.ops.similarity import served, similarity_op
 from gsparc.ops.transforms import carries_tangent
@@ -108,6 +109,24 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     if ssim_weight == 0 or not holds_window(prediction):
         return absolute
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
+
+
+def task_loss(prediction: Tensor, batch: Batch, ssim_weight: float, snapshot: Snapshot = "none") -> Tensor:
+    """Loss (B,) of spectra, channels or powers; what was not measured counts as met.
+
+    Args:
+        prediction: like the targets of `batch`.
+        batch: with targets and mask.
+        ssim_weight: see `spectrum_loss`.
+        snapshot: see `channel_loss`; powers have no phase.
+    """
+    if prediction.is_complex():
+        return channel_loss(prediction, batch.target, batch.mask, snapshot)
+    if prediction.dim() == 2:
+        return channel_loss(prediction, batch.target, batch.mask)
+    if batch.mask is not None:
+        prediction = torch.where(batch.mask, prediction, batch.target)
+    return spectrum_loss(prediction, batch.target, ssim_weight)
 
 
 def channel_loss(

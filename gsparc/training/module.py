@@ -1,4 +1,4 @@
-"""The LightningModule: field, rasterizer and confidence-weighted loss in one training step."""
+"""LightningModules: of any model that answers queries, and of Gaussians that are rendered."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 import lightning.pytorch as L
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
+from gsparc.data.schema import Site
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
 from gsparc.field.initial import Snapshot
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
-from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
-from gsparc.training.optimizer import OptimizerSettings, kind_of, optimizer_for, scheduler_for
+from gsparc.training.losses import holds_window, ssim, task_loss
+from gsparc.training.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
 from gsparc.training.processes import count
 
 
@@ -42,24 +44,27 @@ class NonFiniteLoss(RuntimeError):
     """Training met a NaN or an infinity; batch and parameters are on disk."""
 
 
-class GaussianModule(L.LightningModule):
-    """Trains a Gaussian field by rendering.
+class NetworkModule(L.LightningModule):
+    """Trains a network by its own loss.
 
     Args:
-        model: what is trained.
-        loss: task loss.
-        optimizer: learning rates.
+        model: called with tx (B, 3) [m] and receiver poses, gives targets (B, ...); `loss(batch, draw)` is ()
+            of a batch, with a generator for what is drawn at random.
+        site: what the data declare.
+        rates: of its schedule, and of its parameters where `rate_of` does not say.
         total_steps: length of the schedules.
         run_dir: where a poisoned batch is left.
+        rate_of: see `optimizer_for`.
     """
 
+    count: int | None = None  # of Gaussians that callbacks may edit
+
     def __init__(
-        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings,
-        total_steps: int, run_dir: Path,
+        self, model: Any, site: Site, rates: OptimizerSettings, total_steps: int, run_dir: Path,
+        rate_of: RateOf | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.model = model
-        self.loss, self.rates = loss, optimizer
+        self.model, self.site, self.rates, self.rate_of = model, site, rates, rate_of
         self.total_steps, self.run_dir = total_steps, run_dir
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
@@ -70,35 +75,22 @@ class GaussianModule(L.LightningModule):
         self.figures: dict[str, float] = {}  # of all validation rows, at the last look
         self._looks: list[tuple[Tensor, dict[str, Tensor]]] = []
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
-        self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
-    def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Loss per sample (B,) before confidence; what was not measured counts as met."""
-        if self.model.site.kind == "spectrum":
-            if batch.mask is not None:
-                prediction = torch.where(batch.mask, prediction, batch.target)
-            return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
-        snapshot = self.loss.snapshot if self.model.site.kind == "csi" else "none"  # powers have no phase
-        return channel_loss(prediction, batch.target, batch.mask, snapshot)
+    def mean(self, batch: Batch) -> Tensor:
+        """Targets (B, ...) as predicted."""
+        return self.model(batch.tx, batch.rx)
 
-    def _render(self, batch: Batch) -> Rendered:
-        try:
-            return self.model(batch.tx, batch.rx)
-        except UnsoundGaussian as refused:  # a NaN, an infinity, or what would overflow to one
-            row = int(self.model.gaussians.ids[refused.index])
-            raise self._stop(batch, int(batch.index[0]), f"Gaussian id {row}: {refused}") from refused
+    def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Loss () of a step on a batch, and the task's of each sample (B,), where these are told apart."""
+        # Draws are a pure function of (seed, step): a resumed run goes on with the same.
+        draw = torch.Generator().manual_seed(torch.initial_seed() + self.global_step)
+        loss = self.model.loss(batch, draw)
+        return loss, loss.expand(len(batch))
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
-        """Confidence-weighted loss of a batch."""
+        """Loss of a batch; one that is not finite ends training."""
         self.batch = batch
-        self.rendered = self._render(batch)
-        task = self.task_loss(self.rendered.mean, batch)
-        confidence = self.model.confidence
-        if confidence is None:
-            loss = task.mean()
-        else:
-            exponent = confidence.exponent(self.model.site.moving(batch.tx, batch.rx))
-            loss = weighted(task, exponent, confidence.settings.alpha).mean()
+        loss, task = self.losses(batch)
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
@@ -107,32 +99,19 @@ class GaussianModule(L.LightningModule):
             self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
             # weighted by the confidence, where there is one
             self.log("train/loss", loss.detach() * part, sync_dist=True)
-            self.log("model/num_gaussians", float(self.count))
+            if self.count is not None:
+                self.log("model/num_gaussians", float(self.count))
         return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """The rates of the step that was taken, under the names of their settings (`OptimizerSettings`)."""
         if self.global_step % self.log_every == 0:
             groups = self.trainer.optimizers[0].param_groups
-            self.log_dict({f"rate/{kind_of(group['name'])}": group["lr"] for group in groups})
-
-    @property
-    def count(self) -> int:
-        """Number of Gaussians."""
-        return len(self.model.gaussians)
-
-    def error(self, batch: Batch) -> Tensor:
-        """Squared error of each row (B,): per entry, of powers in decibels."""
-        return squared_error(self._render(batch).mean, batch, str(self.site.kind))
-
-    @property
-    def site(self) -> Any:
-        """What the data declare."""
-        return self.model.site
+            self.log_dict({f"rate/{group['kind']}": group["lr"] for group in groups})
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""
-        mean = self._render(batch).mean
+        mean = self.mean(batch)
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
@@ -150,30 +129,27 @@ class GaussianModule(L.LightningModule):
         # Dashboards get the seconds beside every figure too.
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
 
-    def on_validation_epoch_start(self) -> None:
-        """Begin a look."""
-        self._looks = []
-
     def on_validation_epoch_end(self) -> None:
         """Keep the errors of all rows and their figures: Lightning drops those of the look before step 1."""
-        if not self._looks:
+        looks, self._looks = self._looks, []
+        if not looks:
             return
-        self.held_out = torch.cat([errors for errors, _ in self._looks]).double().cpu()
-        share = [len(errors) / len(self.held_out) for errors, _ in self._looks]
-        every = [figures for _, figures in self._looks]
+        self.held_out = torch.cat([errors for errors, _ in looks]).double().cpu()
+        rows = [len(errors) for errors, _ in looks]
         self.figures = {
-            name: sum(part * float(one[name]) for part, one in zip(share, every, strict=True))
-            for name in every[0]
+            name: float(np.average([float(figures[name]) for _, figures in looks], weights=rows))
+            for name in looks[0][1]
         }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
         """Targets (B, ...) in stored units, spectra within [0, 1]."""
-        mean = self._render(batch).mean
+        mean = self.mean(batch)
         return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
 
     def test_step(self, batch: Batch, step: int) -> None:
         """Log the squared error of test rows; `gsparc evaluate` has all figures."""
-        self.log("test/error", self.error(batch).mean(), batch_size=len(batch))
+        error = squared_error(self.mean(batch), batch, self.site.kind).mean()
+        self.log("test/error", error, batch_size=len(batch))
 
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
@@ -184,14 +160,9 @@ class GaussianModule(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""
-        optimizer = optimizer_for(self.model, self.rates)
+        optimizer = optimizer_for(self.model, self.rates, self.rate_of)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
-        """Make room for the number of Gaussians before their tensors arrive."""
-        edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
-        return super().load_state_dict(state_dict, *rest, **named)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A poisoned state never replaces a good checkpoint."""
@@ -199,17 +170,9 @@ class GaussianModule(L.LightningModule):
             raise self._stop(self.batch, int(self.batch.index[0]))
 
     def _offender(self) -> str | None:
-        """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
-        rows = edit.row_parameters(self.model, len(self.model.gaussians))
-        for name, parameter in self.model.named_parameters():
-            bad = ~torch.isfinite(parameter)
-            if not bad.any():
-                continue
-            if name not in rows:
-                return name
-            row = int(bad.nonzero()[0, 0])
-            return f"Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
-        return None
+        """The first parameter that is not finite; None when all are."""
+        bad = (name for name, p in self.model.named_parameters() if not torch.isfinite(p).all())
+        return next(bad, None)
 
     def _stop(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
         """Leave batch, parameters and the first offender on disk; the error that says so."""
@@ -227,6 +190,69 @@ class GaussianModule(L.LightningModule):
             f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
             f"batch and parameters are in {path}"
         )
+
+
+class GaussianModule(NetworkModule):
+    """Trains a Gaussian field by rendering.
+
+    Args:
+        model: what is trained.
+        loss: task loss.
+        optimizer: learning rates.
+        total_steps: length of the schedules.
+        run_dir: where a poisoned batch is left.
+    """
+
+    def __init__(
+        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings,
+        total_steps: int, run_dir: Path,
+    ) -> None:  # fmt: skip
+        super().__init__(model, model.site, optimizer, total_steps, run_dir)
+        self.loss = loss
+        self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
+
+    @property
+    def count(self) -> int:  # type: ignore[override]
+        """Number of Gaussians."""
+        return len(self.model.gaussians)
+
+    def mean(self, batch: Batch) -> Tensor:
+        """See `NetworkModule`."""
+        return self._render(batch).mean
+
+    def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """See `NetworkModule`; weighted by the confidence, where there is one."""
+        self.rendered = self._render(batch)
+        task = self.task_loss(self.rendered.mean, batch)
+        confidence = self.model.confidence
+        if confidence is None:
+            return task.mean(), task
+        exponent = confidence.exponent(self.site.moving(batch.tx, batch.rx))
+        return weighted(task, exponent, confidence.settings.alpha).mean(), task
+
+    def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
+        """Loss per sample (B,) before confidence; what was not measured counts as met."""
+        return task_loss(prediction, batch, self.loss.ssim_weight, self.loss.snapshot)
+
+    def _render(self, batch: Batch) -> Rendered:
+        try:
+            return self.model(batch.tx, batch.rx)
+        except UnsoundGaussian as refused:  # a NaN, an infinity, or what would overflow to one
+            row = int(self.model.gaussians.ids[refused.index])
+            raise self._stop(batch, int(batch.index[0]), f"Gaussian id {row}: {refused}") from refused
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
+        """Make room for the number of Gaussians before their tensors arrive."""
+        edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        return super().load_state_dict(state_dict, *rest, **named)
+
+    def _offender(self) -> str | None:
+        """See `NetworkModule`; with the id of the Gaussian."""
+        name = super()._offender()
+        if name not in edit.row_parameters(self.model, self.count):
+            return name
+        bad = ~torch.isfinite(self.model.get_parameter(name))
+        return f"Gaussian id {int(self.model.gaussians.ids[int(bad.nonzero()[0, 0])])}, {name}"
 
 
 def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from torch import nn
@@ -10,6 +11,8 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
 from gsparc.data.limits import Checked, internal, number, setting, whole
+
+RateOf = Callable[[str], tuple[str, float]]
 
 RATE = number(0)
 WARMUP = 0.1  # of the steps after a start in closed form
@@ -49,6 +52,11 @@ class OptimizerSettings(Checked):
         }
         return replace(self, **shares, warmup=max(self.warmup, round(WARMUP * total)))
 
+    def rate_of(self, name: str) -> tuple[str, float]:
+        """Kind and initial rate of a parameter by its dotted name; `KeyError` where none is declared."""
+        kind = kind_of(name)
+        return kind, getattr(self, kind)
+
 
 KINDS = {
     "gaussians.means": "positions",
@@ -72,13 +80,19 @@ def kind_of(name: str) -> str:
     )
 
 
-def optimizer_for(model: nn.Module, settings: OptimizerSettings) -> Adam:
-    """Adam with one parameter tensor per group, so that surgery can exchange single tensors."""
-    groups = [
-        {"params": [parameter], "lr": getattr(settings, kind_of(name)), "name": name}
-        for name, parameter in model.named_parameters()
-        if parameter.requires_grad
-    ]
+def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf | None = None) -> Adam:
+    """Adam with one parameter tensor per group, so that surgery can exchange single tensors.
+
+    Args:
+        model: what is trained.
+        settings: rates by kind of parameter, and epsilon.
+        rate_of: gives another model's kinds of parameters, and their initial rates, by dotted name.
+    """
+    groups = []
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            kind, rate = (rate_of or settings.rate_of)(name)
+            groups += [{"params": [parameter], "lr": rate, "name": name, "kind": kind}]
     return Adam(groups, eps=settings.eps, fused=True)
 
 
@@ -99,4 +113,4 @@ def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> L
     def factor(kind: str):
         return lambda step: rate_factor(kind, settings, step, total)
 
-    return LambdaLR(optimizer, [factor(kind_of(group["name"])) for group in optimizer.param_groups])
+    return LambdaLR(optimizer, [factor(group["kind"]) for group in optimizer.param_groups])

@@ -13,7 +13,10 @@ def stage(data, fold, run_dir, step):
         return SimpleNamespace(mean=data.targets(np.arange(len(tx))))
 
     model = type("Model", (), {"site": data.site, "__call__": lambda self, tx, rx: predict(tx, rx)})()
-    module = SimpleNamespace(model=model, site=model.site, run_dir=run_dir, device="cpu", total_steps=25)
+    module = SimpleNamespace(
+        mean=lambda batch: predict(batch.tx, batch.rx).mean, site=model.site, run_dir=run_dir, device="cpu",
+        total_steps=25,
+    )  # fmt: skip
     loaded = SimpleNamespace(measurements=data, fold=fold)
     trainer = SimpleNamespace(
         global_step=step, max_steps=25, datamodule=loaded, callbacks=[], loggers=[], is_global_zero=True

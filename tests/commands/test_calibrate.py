@@ -13,22 +13,28 @@ from campaigns import brief, compose, spectra
 from gsparc.commands.calibrate import tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.evaluation import calibration as command
-from gsparc.evaluation.calibration import (
+from gsparc.data.splits import far_apart
+from gsparc.evaluation import open_runs as command
+from gsparc.evaluation.open_runs import collect
+from gsparc.evaluation.pictures import draw_calibration
+from gsparc.prediction.confidence import gather
+from gsparc.prediction.risk import (
+    Evidence,
+    Guarantee,
+    Threshold,
     Trial,
     best_kind,
     bounded,
     cells,
-    collect,
+    choose,
     divided,
-    draw_calibration,
     figures,
+    joined,
+    levels_of,
     rank_correlation,
     risk_coverage,
     trials,
 )
-from gsparc.prediction.confidence import Evidence, gather, joined
-from gsparc.prediction.risk_threshold import Guarantee, Threshold, choose, levels_of, spread_out
 from gsparc.training.context import FitContext
 
 
@@ -120,12 +126,9 @@ def test_parts_are_disjoint_and_cells_stay_whole() -> None:
 
 def test_thinned_rows_keep_their_distance() -> None:
     evidence = _evidence()
-    kept = spread_out(evidence.position, np.arange(300), 0.3, np.random.default_rng(0))
+    kept = far_apart(evidence.position, np.arange(300), 0.3, np.random.default_rng(0))
     apart = np.linalg.norm(evidence.position[kept][:, None] - evidence.position[kept], axis=-1)
     assert apart[np.triu_indices(len(kept), 1)].min() > 0.3
-    assert np.array_equal(
-        spread_out(evidence.position, np.arange(9), 0, np.random.default_rng(0)), np.arange(9)
-    )
 
 
 def test_evidence_of_a_method(campaign, folds) -> None:

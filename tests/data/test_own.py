@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsparc.data.load import load
 from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
 from gsparc.training.losses import WINDOW_RADIUS
 
@@ -114,19 +113,3 @@ def test_a_refused_file_is_not_written(tmp_path, csi_arrays):
     with pytest.raises(ValueError, match="row 0"):
         write_own(tmp_path / "bad.h5", csi_arrays)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_newrf_conference(real_newrf):
-    data = load({"name": "newrf", "file": str(real_newrf)})
-    assert data.site.kind == "csi" and data.site.static_end == "tx" and data.site.grid is None
-    assert data.target.shape == (433, 1, 1) and data.target.dtype == np.complex64
-    assert 0.85 < np.mean(np.abs(data.target) ** 2) < 1.2
-    with np.load(real_newrf) as file:
-        np.testing.assert_allclose(data.target[:, 0, 0] * data.site.target_scale, file["csi"], rtol=1e-5)
-        assert [len(part) for part in data.release_split] == [346, 87]
-        # About 41 % of the path power comes from below the horizon: no hemisphere for this room.
-        down = np.concatenate(data.directions)[:, 2] < 0
-        power = np.abs(file["path_gain"]) ** 2
-    assert power[down].sum() / power.sum() == pytest.approx(0.41, abs=0.02)
-    batch = data.batch(np.arange(5))
-    assert batch.rx.batched and batch.rx.position.shape == (5, 3)

@@ -9,7 +9,7 @@ from networks import network
 from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.load import datamodule
-from gsparc.data.tables.sectors import band_hz, earfcn_hz, meaning
+from gsparc.data.tables.sectors import band_hz, earfcn_hz
 
 
 def write(path, heads, rows):
@@ -81,27 +81,6 @@ def test_cells_that_a_list_lacks_are_counted(tmp_path):
     )
     assert any(note.startswith("1 of ") and "not in the list, with" in note for note in reading.notes)
     assert np.isnan(reading.data.site.stations.position).any(axis=1).sum() == 1
-
-
-@pytest.mark.parametrize(
-    ("head", "said"),
-    [
-        *(("Azimuth (deg)", "station_azimuth"), ("E-Tilt", "electrical"), ("Mechanical Tilt", "mechanical")),
-        *(
-            ("Antenna Downtilt", "total"),
-            ("HBW", "station_width"),
-            ("Vertical Beamwidth", "station_thickness"),
-        ),
-        *(
-            ("EIRP [dBm]", "station_power_db"),
-            ("Band", "band"),
-            ("Antenna Height", "height"),
-            ("Vendor", None),
-        ),
-    ],
-)
-def test_heads_of_lists(head, said):
-    assert meaning(head) == said
 
 
 def test_channels_and_bands():

@@ -197,6 +197,12 @@ CASES = {
         "good",
         "refused",
     ),
+    "per cent in cells": (
+        long("t", range(ROWS), level=[f"{v + 110}%" for v in LEVELS[:, 0]]),
+        {},
+        "a quality, not a level",
+        "more rows",
+    ),
     "losses": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]), {}, "rssi_db=path_loss*-1 takes losses", ""),
     "losses that are said": (
         table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),

@@ -220,7 +220,7 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
-    field = fitted.method.solution
+    field = fitted.method.chosen
     assert sum(field.weights) == pytest.approx(1)
     completed = [isinstance(member, Residual) and member.rest is not None for member in field.members]
     assert completed == [False, True, True]
@@ -229,9 +229,9 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert again.solution.weights == field.weights
+    assert again.chosen.weights == field.weights
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
-    again.solution.condition(fitted.data, rows)  # the same rows, the same weights
+    again.chosen.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
     one, two = (m.predict(batch).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
@@ -277,9 +277,9 @@ def test_without_the_residual_gaussians_are_alone(name):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
-    found = method.solution.predict(batch)
+    found = method.chosen.predict(batch)
     torch.testing.assert_close(found.mean, found.explained)
-    assert not isinstance(method.solution.only, Residual)
+    assert not isinstance(method.only, Residual)
 
 
 @pytest.mark.parametrize(

@@ -41,9 +41,10 @@ from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
+PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
-    **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
+    **dict.fromkeys(PEERS, ""),
     "calibrated_raytracer": "",
     "distance_law": "",
     "gp": "Reducible",
@@ -155,7 +156,7 @@ def test_a_method_is_what_the_table_says(name):
     method = method_class(name)()
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in ("image_source_gp", "splat", "gsparc", *NAMED))
+    assert method.resumable == (name in (*PEERS, "image_source_gp", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 

@@ -155,6 +155,6 @@ def test_places_come_nearer_to_the_truth_in_techtile():
     error = np.random.default_rng(0).normal(scale=0.03, size=(len(rows), 3))
     moved = displaced(data, rows, error)
     method, _ = _fitted(moved, Fold(rows[:-20], rows[-20:], rows[:0]))
-    found, by, said = refined(method.solution, moved, np.full(len(data), 0.03))
+    found, by, said = refined(method.chosen, moved, np.full(len(data), 0.03))
     assert np.array_equal(np.sort(found), rows) and "refined by" in said
     assert np.square(error + by)[:, :2].mean() < 0.9 * np.square(error)[:, :2].mean()

@@ -13,8 +13,8 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.model import AttenuationSettings
-from gsparc.models.closed_forms import ClosedForms
 from gsparc.models.gsparc import Gsparc, choose
+from gsparc.models.mixture.named import NamedMixture
 from gsparc.models.terms import EffectSettings
 from gsparc.ops import SphereGrid
 
@@ -37,7 +37,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         field=FieldSettings(count=count), **more,
     )  # fmt: skip
     found = choose(data, settings)
-    parts = found.parts(data) if isinstance(found, ClosedForms) else ()
+    parts = found.tries(data) if isinstance(found, NamedMixture) else ()
     return parts, not parts and found.settings.response.array
 
 

@@ -18,7 +18,7 @@ from gsparc.prediction.confidence import (
     known_positions,
     position_kernel,
 )
-from gsparc.prediction.risk_threshold import Guarantee
+from gsparc.prediction.risk import Guarantee
 from gsparc.training.context import FitContext
 
 

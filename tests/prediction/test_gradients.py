@@ -27,10 +27,9 @@ from gsparc.models.channels import complex_gp
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.closed_forms import Powers
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.named import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
@@ -100,7 +99,7 @@ class Assembled(Powers):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         self.site, report = data.site, self.method.fit(data, fold, context)
-        self.solution = Mixture.of([self.method])
+        self.members, self.weights = [self.method], (1.0,)
         if not isinstance(self.method, MovingArrayField):
             waves = [
                 fitted_to(ChannelField(ChannelSettings(direct=direct)), data, fold.train)[0]
@@ -108,7 +107,7 @@ class Assembled(Powers):
             ]
             sources = Residual(self.method)
             sources.site, sources.rest, sources.share = data.site, waves[1], 0.3
-            self.solution = Mixture.of([sources, waves[0]], (0.6, 0.4))
+            self.members, self.weights = [sources, waves[0]], (0.6, 0.4)
         return report
 
 

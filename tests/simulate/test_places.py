@@ -1,7 +1,6 @@
 """Transmitters with sectors; receivers on a grid, along lines and out of files; objects as a mesh."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from gsparc.data.links.georeference import Georeference
@@ -95,21 +94,6 @@ def test_receivers_of_a_table_in_degrees_with_times(tmp_path):
     with pytest.raises(ValueError, match="1 of 3 receivers stand in or on something, the first at row 2"):
         laid(kind="file", file=str(tmp_path / "hut.csv"))
     assert len(laid(kind="file", file=str(tmp_path / "hut.csv"), inside="drop").places) == 2
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".txt", ".CSV", ".parquet", ".npz"])
-def test_times_are_read_from_every_kind_of_table(suffix, tmp_path):
-    """They were read from *.csv with commas alone."""
-    file = tmp_path / f"walk{suffix}"
-    table = pd.DataFrame({"x": [6.0, 12, 18], "y": 5.0, "z": 1.5, "time_s": [0, 2, 5]})
-    if suffix == ".parquet":
-        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-        table.to_parquet(file)
-    elif suffix == ".npz":
-        np.savez(file, rx_position=table[["x", "y", "z"]].to_numpy(), time_s=table["time_s"].to_numpy())
-    else:
-        table.to_csv(file, index=False, sep={".tsv": "\t", ".txt": ";"}.get(suffix, ","))
-    np.testing.assert_allclose(laid(kind="file", file=str(file)).time_s, [0, 2, 5])
 
 
 @pytest.mark.parametrize("cell, words", [("noon", "finite number"), ("", "line 3: no number")])

@@ -18,7 +18,8 @@ from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
 from gsparc.prediction.channels import interpolated
-from gsparc.prediction.confidence import Evidence, judged, rivals
+from gsparc.prediction.confidence import judged, rivals
+from gsparc.prediction.risk import Evidence
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World

@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.apps.link.adaptation import Rates
 from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
-from gsparc.prediction.risk_threshold import binomial_interval
+from gsparc.prediction.risk import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),

@@ -23,10 +23,9 @@ from gsparc.apps.link.study import (
     tradeoff,
     transmit,
 )
-from gsparc.evaluation.calibration import accept
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
-from gsparc.prediction.risk_threshold import Guarantee
+from gsparc.prediction.risk import Guarantee, accept
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.apps.link.pusch import Pusch
-from gsparc.prediction.risk_threshold import binomial_interval
+from gsparc.prediction.risk import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse"

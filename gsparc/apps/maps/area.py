@@ -117,8 +117,11 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
         if Path(area).suffix.lower() not in (".geojson", ".json"):
             raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
         origin = None if site is None else site.georeference
-        shapes = read_shapes(area, "area", origin, site_m=width)
-        return *shapes.bounds(), shapes.contains
+        drawn, _ = read_shapes(area, "area", origin, site_m=width)
+        from shapely import contains_xy
+
+        low, high = np.reshape(drawn.bounds, (2, 2))
+        return low, high, lambda places: contains_xy(drawn, places)
     if area is not None:
         low, high = _rectangle(area)
         if (high - low).max() < LEAST * width:

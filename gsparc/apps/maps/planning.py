@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from gsparc.apps.maps.area import Grid, grid_of
 from gsparc.apps.maps.covariance import ErrorCovariance, before_measuring, unknown_of
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.geojson import Shapes, read_shapes
+from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import answering
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
@@ -181,18 +181,19 @@ def coarse_grid(
 def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
     """Places (n, 3) in polygons or along lines of a file."""
     left, right, south, north = grid.extent
-    shapes: Shapes = read_shapes(path, key, origin, True, max(right - left, north - south))
+    area, lines = read_shapes(path, key, origin, True, max(right - left, north - south))
+    from shapely import contains_xy, get_coordinates
+
     points = [np.zeros((0, 2))]
-    if shapes.polygons:
-        low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
+    if not area.is_empty:
+        low, high = np.reshape(area.bounds, (2, 2))
         step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
         x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        points.append(every[shapes.contains(every)])
-    for line in shapes.lines:
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        at = np.linspace(0, along[-1], max(2, int(np.ceil(2 * along[-1] / grid.step)) + 1))
-        points.append(np.column_stack([np.interp(at, along, line[:, k]) for k in range(2)]))
+        points.append(every[contains_xy(area, every)])
+    for line in lines:
+        at = np.linspace(0, line.length, max(2, int(np.ceil(2 * line.length / grid.step)) + 1))
+        points.append(get_coordinates(line.interpolate(at)))
     places = np.unique(np.concatenate(points), axis=0)
     if not len(places):
         raise DataError(f"{key}={path}: its polygons are too small for any place")

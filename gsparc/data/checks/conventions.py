@@ -19,6 +19,7 @@ import numpy as np
 
 from gsparc.data.conventions import CONVENTIONS, Signals, mended
 from gsparc.data.errors import some
+from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
 
 RATIO = math.log(1000)  # of likelihoods
@@ -81,20 +82,19 @@ def convention_warnings(data: Measurements) -> list[str]:
 
 def _arrayed(data: Measurements, signals: Signals) -> tuple[Signals, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
-    stations, place = data.site.stations, data.place
+    stations = data.site.stations
     run = np.zeros(len(data), np.int64) if data.run is None else data.run
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
     single = signals.tones is not None and signals.values.shape[1] == 1
-    if stations is None or place is None or len(stations) < COHERENT or not single:
+    if stations is None or data.place is None or len(stations) < COHERENT or not single:
         return signals, run * (int(station.max()) + 1) + station
-    _, first, of_place = np.unique(place, return_index=True, return_inverse=True)
-    shape = (len(first), len(stations), signals.values.shape[2])
-    values, mask = np.zeros(shape, signals.values.dtype), np.zeros(shape, bool)
-    values[of_place, station] = signals.values[:, 0]
-    mask[of_place, station] = True if signals.mask is None else signals.mask[:, 0]
-    middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(first), 1, 1))
-    ends = data.moving[first], np.tile(middle, (len(first), 1))
-    return Signals(values, mask, *ends, turned, signals.tones, stations.position - middle), run[first]
+    heard = Snapshots.of(data, np.arange(len(data)))
+    measured = np.ones(signals.values.shape, bool) if signals.mask is None else signals.mask
+    middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
+    ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
+    array = stations.position[heard.stations] - middle
+    mask = heard.arranged(measured) != 0
+    return Signals(heard.values, mask, *ends, signals.tones, array), heard.run
 
 
 def _drawn(signals: Signals) -> np.ndarray:
@@ -192,9 +192,9 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
     count = min(DELAYS * len(tones), 256) if len(tones) > 1 else 1
     delays = (np.arange(count) - count // 2) / count / spacing
     antennas = direct @ np.exp(2j * np.pi * np.outer(tones - tones.mean(), delays))
-    used = measured.sum(axis=(1, 2)) / (
-        1 if signals.array is not None else measured.any(axis=2).sum(axis=1).clip(1)
-    )
+    used = measured.sum(axis=(1, 2)).astype(float)
+    if signals.array is None:
+        used /= measured.any(axis=2).sum(axis=1).clip(1)
     power = (used * (np.abs(values) ** 2).sum(axis=(1, 2))).clip(1e-300)
 
     def best(share: np.ndarray) -> tuple[np.ndarray, int]:  # likelihoods (S,) at the delay that fits best
@@ -208,9 +208,8 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
     else:
         rows, delay = best(np.abs(antennas.sum(axis=1)) ** 2)
         factor = antennas[:, :, delay].sum(axis=1)
-        other = antennas[
-            :, :, best((np.abs(antennas) ** 2).sum(axis=1))[1]
-        ]  # of antennas whose phases are free
+        # Of antennas whose phases are free.
+        other = antennas[:, :, best((np.abs(antennas) ** 2).sum(axis=1))[1]]
         if len(values) > 2 * other.shape[1]:
             level = np.sqrt((np.abs(other) ** 2).mean(axis=1, keepdims=True)).clip(1e-150)
             phases = np.angle(np.linalg.svd(other / level, full_matrices=False)[2][0])
@@ -260,10 +259,10 @@ def _decibels(signals: Signals, scale: float) -> list[str]:
     of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
     if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
         return []
-    how = (
-        f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam more than"
-    )
-    return [f"{how} 1,000 times better as decibels: dataset.decibels=true makes them linear"]
+    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g},"
+    return [
+        f"{how} fit a beam more than 1,000 times better as decibels: dataset.decibels=true makes them linear"
+    ]
 
 
 def _lobe(values: np.ndarray, directions: np.ndarray) -> float:

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 from gsparc.data.checks import outliers
 from gsparc.data.checks.coherence import coherence
 from gsparc.data.errors import some
+from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.splits import Split, SplitSettings, make_split, visits
+from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
@@ -173,9 +174,8 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
     on_earth = reach.max() <= 180 and reach.min() <= 90
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
-        return [
-            f"positions near {near} within {across:.2g}: degrees? then give them as latitude and longitude"
-        ]
+        how = "then give them as latitude and longitude"
+        return [f"positions near {near} within {across:.2g}: degrees? {how}"]
     groups = outliers.two_groups(positions[:, :2])
     if groups is not None:
         by = f", as column {zones!r} says" if zones else ""
@@ -189,9 +189,8 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         return [f"{far}; {hint}"]
     if across > 1000 and (positions % 1 == 0).all():
         size = " x ".join(f"{e / 1000:.4g}" for e in extent)
-        return [
-            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
-        ]
+        said = f"positions are whole numbers up to {across:.0f} apart"
+        return [f"{said}: millimetres? the box is {size} m then"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
@@ -231,9 +230,7 @@ def side_of_squares(data: Measurements) -> float | None:
 def held_out(data: Measurements, side: float) -> np.ndarray:
     """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
-        settings = SplitSettings("blocks", side_m=side)
-        where, place = data.moving - data.moving.min(axis=0), visits(data.moving, data.place)
-        split = make_split(where, settings, None, np.zeros(0, np.int64), place, data.station)
+        split = split_for({"name": "blocks", "side_m": side}, data)
         split.check()
     except ValueError:
         return np.zeros(0, np.int64)

@@ -89,6 +89,9 @@ def level_steps(
     return tuple(sorted(steps, key=lambda step: step.first))
 
 
+Steps = tuple[list[int], np.ndarray, np.ndarray]
+
+
 def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
     """Consecutive rows in at most about `most` groups, none across a gap."""
     size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
@@ -122,9 +125,7 @@ def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray
     return np.exp(-distance / reach) + nugget * np.eye(len(distance))
 
 
-def _search(
-    precision: np.ndarray, level: np.ndarray, regressors: np.ndarray
-) -> tuple[list[int], np.ndarray, np.ndarray]:
+def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> Steps:
     """First blocks after steps, estimates [dB] of all steps together, and how many deviations each is."""
     count = len(level)
     margin = max(3, int(SHORTEST * count))
@@ -146,12 +147,10 @@ def _search(
         after.pop(int(weak))
 
 
-def _best(
-    precision: np.ndarray, level: np.ndarray, regressors: np.ndarray, steps: list[int], margin: int
-) -> int:
+def _best(precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int) -> int:
     """The block after the most significant step, besides `steps`."""
     count = len(level)
-    design = np.column_stack([regressors, *(_step(count, k) for k in steps)])
+    design = np.column_stack([mean, *(_step(count, k) for k in steps)])
     weighed = precision @ design
     projected = precision - weighed @ np.linalg.pinv(design.T @ weighed) @ weighed.T
     # For a step h_k = [row >= k]: h_k' P y and h_k' P h_k are sums over the rows from k on.

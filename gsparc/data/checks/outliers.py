@@ -125,10 +125,8 @@ def far_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None)
                 turned = origin.from_degrees(longitude, latitude)
         swapped = bool(beyond(turned)[0] < 0.1 * distance[far])
         hint = f"are {axes} swapped?" if swapped else "are both in one system and unit?"
-        fault = (
-            f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over {width:.4g} m; {hint}"
-        )
-        return fault, swapped or bool(distance[far] > TOO_DISTANT_M)
+        fault = f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over {width:.4g} m"
+        return f"{fault}; {hint}", swapped or bool(distance[far] > TOO_DISTANT_M)
     below, above = float(low[2] - still[:, 2].min()), float(still[:, 2].max() - high[2])
     if max(below, above) > APART_M:
         side = "below" if below > above else "above"

@@ -71,13 +71,11 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low >= 0 and high <= 1:
-        warnings.append(
-            f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W"
-        )
+        said = f"all levels lie between {low:g} and {high:g}"
+        warnings.append(f"{said}: linear power? then give it as rssi, in W")
     elif high > HIGHEST_DBM and low >= 0:
-        warnings.append(
-            f"levels from {low:g} to {high:g} are all positive: losses, percent, or linear? expected dBm"
-        )
+        said = f"levels from {low:g} to {high:g} are all positive"
+        warnings.append(f"{said}: losses, percent, or linear? expected dBm")
     elif high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")

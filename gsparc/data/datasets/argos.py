@@ -20,7 +20,7 @@ from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.position_encoder import EncoderSettings, encoder_for
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, TrainTest
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
@@ -70,7 +70,7 @@ def load_argos(
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
-    where = _positions(root, positions, encoder, uplink, split)
+    where = _places(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -98,37 +98,6 @@ def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
     # The phase of the sum over all antennas and tones.
     phase = np.angle(straight[..., :UPLINK].sum((1, 2)))
     return straight * np.exp(-1j * phase)[:, None, None]
-
-
-def published_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex, float]:
-    """Mean and standard deviation that published loaders remove, each one number for all entries.
-
-    Args:
-        values: (S, A, K) targets.
-        train: rows they are taken over.
-    """
-    chosen = values[train].astype(np.complex128)
-    mean = complex(chosen.mean())
-    return mean, float(np.sqrt((np.abs(chosen - mean) ** 2).mean()))
-
-
-def published_figures(
-    predicted: np.ndarray, target: np.ndarray, mean: complex, spread: float
-) -> dict[str, float]:
-    """NMSE and mean SNR of all tones and of the first one, as published figures are computed.
-
-    Args:
-        predicted, target: (n, A, K), denormalised.
-        mean, spread: what is removed from both; 0 and 1 for the denormalised figures.
-    """
-    guess, truth = (predicted - mean) / spread, (target - mean) / spread
-    figures = {}
-    for name, tones in (("", slice(None)), ("_first_tone", slice(0, 1))):
-        error = (np.abs(guess[..., tones] - truth[..., tones]) ** 2).sum((1, 2))
-        power = (np.abs(truth[..., tones]) ** 2).sum((1, 2))
-        figures[f"nmse{name}"] = float(error.sum() / power.sum())
-        figures[f"snr_db{name}"] = float(np.mean(10 * np.log10(power / error)))
-    return figures
 
 
 def _channels(root: Path) -> np.ndarray:
@@ -175,19 +144,13 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _positions(
-    root: Path,
-    positions: str,
-    encode: Encoder | None,
-    uplink: np.ndarray,
-    split: tuple[np.ndarray, np.ndarray] | None,
-) -> np.ndarray:
-    if positions == "true":
-        return _true_positions(root / "positions.npy", len(uplink))
-    if positions != "encoder" or encode is None:
-        raise DataError(f"dataset.positions={positions!r}: expected encoder or true")
-    rows = np.arange(len(uplink)) if split is None else split[0]
-    return encode(uplink, rows)
+def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
+    if of == "true":
+        return _true_positions(root / "positions.npy", len(up))
+    if of != "encoder" or code is None:
+        raise DataError(f"dataset.positions={of!r}: expected encoder or true")
+    rows = np.arange(len(up)) if split is None else split[0]
+    return code(up, rows)
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
@@ -231,18 +194,10 @@ class Argos(Release):
 class ArgosSim(Argos):
     """The simulated stand-in in the Argos layout: `dataset=argos_sim`; arguments as of `Argos`."""
 
-    def __init__(
-        self,
-        stand_in: StandIn,
-        antenna: int | str = 0,
-        positions: str | bool = "encoder",
-        align: bool = True,
-        encoder: Mapping[str, Any] | None = None,
-        name: str = "argos_sim",
-        batch_size: int = 16,
-    ) -> None:
-        about = {"antenna": antenna, "positions": positions, "align": align}
-        super().__init__(None, encoder, name=name, stand_in=stand_in, batch_size=batch_size, **about)
+    def __init__(self, stand_in: StandIn, root: None = None, name: str = "argos_sim", **rest: Any) -> None:
+        if root is not None:
+            raise DataError(f"dataset.root={root}: the stand-in has none; say dataset=argos for a release")
+        super().__init__(None, name=name, stand_in=stand_in, **rest)
 
     def load(self) -> Measurements:
         """As `Argos.load`, without a word about the release."""

@@ -104,3 +104,4 @@ class BLE(Campaign):
     """Powers of a beacon at many places, at the sensors of a hall; settings of `raw_of_ble`, `Campaign`."""
 
     choice, reader = "ble", staticmethod(raw_of_ble)
+    inside, marks = "cnf/tetam.dev", frozenset({"mobile_position", "rssi_db"})

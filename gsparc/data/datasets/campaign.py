@@ -20,7 +20,7 @@ from gsparc.data.files import Several, read_text
 from gsparc.data.own import interpret
 from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import KIND_WORDS, REAL, Measurements
+from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
 from gsparc.data.selection import Selection, select
 
 log = logging.getLogger(__name__)
@@ -37,6 +37,9 @@ class Campaign(DataModule):
     """
 
     choice: ClassVar[str]  # of conf/dataset
+    marks: ClassVar[frozenset[str]] = frozenset()  # arrays that an npz of it has, and of no other
+    suffixes: ClassVar[tuple[str, ...]] = ()  # of files of the release
+    inside: ClassVar[str] = ""  # pattern of a file that folders of the release hold
     switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
@@ -171,9 +174,7 @@ def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str =
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
-def read_split(
-    folder: Path, count: int | None, problems: Problems, first: int = 0
-) -> tuple[np.ndarray, np.ndarray] | None:
+def read_split(folder: Path, count: int | None, problems: Problems, first: int = 0) -> TrainTest | None:
     """(train, test) rows from 0 that `train_index.txt` and `test_index.txt` name; None where there are none.
 
     Args:

@@ -21,7 +21,6 @@ from gsparc.data.raw import Raw, read_raw, renamed
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}
 COLUMNS = ("TxPos", "RxPos", "CSI", "Frequency", "LastXPts", "RxChanPerRay", "LineOfSight")
-SUFFIXES = (".pkl", ".pickle")
 
 
 def raw_of_newrf(path: str | Path) -> Raw:
@@ -31,7 +30,7 @@ def raw_of_newrf(path: str | Path) -> Raw:
         DataError: no such file, or arrays are missing, each in a line.
     """
     path = Path(path)
-    raw = Raw(_of_release(path)) if path.suffix.lower() in SUFFIXES else read_raw(path)
+    raw = Raw(_of_release(path)) if path.suffix.lower() in NeWRF.suffixes else read_raw(path)
     missing = [name for name in (*NAMES, "csi", "frequency_hz") if name not in raw.arrays]
     if missing:
         raise DataError([f"{path}, {n}: missing; expected in the layout of NeWRF" for n in missing], path)
@@ -74,3 +73,4 @@ class NeWRF(Campaign):
     """One transmitter, many receivers, complex channels; settings of `Campaign`."""
 
     choice, reader = "newrf", staticmethod(raw_of_newrf)
+    marks, suffixes = frozenset(NAMES), (".pkl", ".pickle")

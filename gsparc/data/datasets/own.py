@@ -10,20 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from gsparc.data.conventions import CONVENTIONS
-from gsparc.data.datasets.ble import raw_of_ble
+from gsparc.data.datasets.ble import BLE
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.newrf import SUFFIXES, raw_of_newrf
-from gsparc.data.datasets.powder import raw_of_powder
+from gsparc.data.datasets.newrf import NeWRF
+from gsparc.data.datasets.powder import Powder
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.datasets.techtile import raw_of_techtile
-from gsparc.data.datasets.techtile_power import raw_of_techtile_power
-from gsparc.data.datasets.wifi_csi import raw_of_wifi_csi
-from gsparc.data.datasets.wsr import raw_of_wsr
+from gsparc.data.datasets.techtile import Techtile
+from gsparc.data.datasets.techtile_power import TechtilePower
+from gsparc.data.datasets.wifi_csi import WifiCsi
+from gsparc.data.datasets.wsr import WSR
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.files import Several
 from gsparc.data.limits import choice, finite, or_null, switch
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import NETCDF_SUFFIXES, Noted, Raw, read_raw
+from gsparc.data.raw import Noted, Raw, read_raw
 from gsparc.data.tables import is_table
 
 log = logging.getLogger(__name__)
@@ -104,43 +104,22 @@ class Own(Campaign):
     switches = tuple(inspect.signature(understood).parameters)[1:-1] + tuple(CONVENTIONS)
 
 
-LOADERS: dict[str, Callable[[Path], Raw]] = {
-    "techtile": raw_of_techtile,
-    "powder": raw_of_powder,
-    "ble": raw_of_ble,
-    "newrf": raw_of_newrf,
-    "techtile_power": raw_of_techtile_power,
-    "wsr": raw_of_wsr,
-    "wifi_csi": raw_of_wifi_csi,
-}
-# What lies in folders of releases.
-FOLDERS = {
-    "ble": "cnf/tetam.dev", "techtile_power": "*_positions.npy",
-    "wsr": "**/csi_rx_*.dat", "wifi_csi": "*.pcap",
-}  # fmt: skip
-PLANE = 2  # coordinates of places in POWDER's files
+CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
+LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind in CAMPAIGNS}
 
 
 def campaign_of(raw: Raw) -> str | None:
     """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
-    arrays = raw.arrays
-    if {"rx_antenna_position", "csi"} <= set(arrays):
-        return "techtile"
-    if {"mobile_position", "rssi_db"} <= set(arrays):
-        flat = arrays["mobile_position"].ndim == 2 and arrays["mobile_position"].shape[1] == PLANE
-        return "powder" if flat else "ble"
-    if {"h2", "root_sign"} <= set(arrays):
-        return "wsr"
-    return "newrf" if {"tx_pos", "rx_pos"} <= set(arrays) else None
+    return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
 def release_of(path: Path) -> str | None:
     """The choice of conf/dataset that reads a file or folder of its makers' release; None where none does."""
-    if path.suffix.lower() in NETCDF_SUFFIXES:
-        return "techtile"
-    if path.suffix.lower() in SUFFIXES:
-        return "newrf"
-    return next((name for name, inside in FOLDERS.items() if path.is_dir() and any(path.glob(inside))), None)
+    folder = path.is_dir()
+    for kind in CAMPAIGNS:
+        if path.suffix.lower() in kind.suffixes or (folder and kind.inside and any(path.glob(kind.inside))):
+            return kind.choice
+    return None
 
 
 def read_any(

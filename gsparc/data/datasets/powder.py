@@ -157,3 +157,4 @@ class Powder(Campaign):
     """Powers of a walking transmitter at fixed stations; settings of `raw_of_powder` and of `Campaign`."""
 
     choice, reader = "powder", staticmethod(raw_of_powder)
+    marks = frozenset({"mobile_position", "latitude"})

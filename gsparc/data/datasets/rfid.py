@@ -24,7 +24,7 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_csv, read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.own_checks import quaternion_to_matrix
-from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.schema import LIGHT, Measurements, TrainTest
 from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
@@ -97,13 +97,10 @@ def load_rfid(
     )  # fmt: skip
 
 
-def _read_list(
-    path: Path, count: int, problems: Problems
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray] | None]:
+def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, TrainTest | None]:
     """Rows (n,) that a list names, of `count`, and the (train, test) rows among them."""
-    cells = problems.attempt(
-        lambda: read_csv(path, "missing; expected a CSV with the columns spectrum,split")
-    )
+    missing = "missing; expected a CSV with the columns spectrum,split"
+    cells = problems.attempt(lambda: read_csv(path, missing))
     wrong = [
         f"line {i + 2}"
         for i, row in enumerate(cells[1:] if cells else [])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -121,22 +122,16 @@ class Sionna(DataModule):
 
     Args:
         file: *.h5.
-        target: `spectrum`, `csi` or `rssi`; None takes what the file was mainly made for.
-        truth: another simulation of the same receivers, which test rows are compared with.
         name, batch_size: see `DataModule`.
+        **settings: see `load_sionna`.
     """
 
-    def __init__(
-        self,
-        file: str | Path,
-        target: str | None = None,
-        truth: str | Path | None = None,
-        name: str = "sionna",
-        batch_size: int = 16,
-    ) -> None:
+    reader = staticmethod(load_sionna)
+
+    def __init__(self, file: str | Path, name: str = "sionna", batch_size: int = 16, **settings: Any) -> None:
         super().__init__(name, batch_size)
-        self.file, self.target, self.truth = Path(file), target, truth
+        self.file, self.settings = Path(file), settings
 
     def load(self) -> Measurements:
         """Spectra (S, H, W), channels (S, A, K) or powers (S, 1)."""
-        return load_sionna(self.file, self.target, self.truth)
+        return load_sionna(self.file, **self.settings)

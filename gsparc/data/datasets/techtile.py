@@ -130,9 +130,8 @@ def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
         DataError: missing, of another form, or without one of the hosts.
     """
     expected = "`antennes:` with a list of tile, channels: [{x, y, z}, {x, y, z}] [m]"
-    content = read_yaml(
-        path, f"the antennas' places; name the file with dataset.antennas, {expected}", expected
-    )
+    absent = f"the antennas' places; name the file with dataset.antennas, {expected}"
+    content = read_yaml(path, absent, expected)
     entries = content.get("antennes", content.get("antennas"))
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected {expected}")
@@ -159,3 +158,4 @@ class Techtile(Campaign):
     """Channels of a moving transmitter at 42 antennas; settings of `raw_of_techtile` and of `Campaign`."""
 
     choice, reader = "techtile", staticmethod(raw_of_techtile)
+    marks, suffixes = frozenset({"rx_antenna_position", "csi"}), NETCDF_SUFFIXES

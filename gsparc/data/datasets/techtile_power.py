@@ -70,3 +70,4 @@ class TechtilePower(Campaign):
     """Received powers on a plane; settings of `Campaign`."""
 
     choice, reader = "techtile_power", staticmethod(raw_of_techtile_power)
+    inside = "*_positions.npy"

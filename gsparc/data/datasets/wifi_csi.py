@@ -71,9 +71,8 @@ def raw_of_wifi_csi(
         raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
     kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
     if len(kinds) > 1:
-        raise DataError(
-            f"{path}: antennas, subcarriers and carriers {some(kinds)}; give each a folder of its own"
-        )
+        said = f"antennas, subcarriers and carriers {some(kinds)}"
+        raise DataError(f"{path}: {said}; give each a folder of its own")
     carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
         raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
@@ -177,9 +176,8 @@ def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.nda
         log.warning("%s: no RSSI: levels are what the gain control left, and may say nothing", path)
         return csi, "dB"
     if np.isnan(rssi_dbm).any():
-        raise DataError(
-            f"{path}: {np.isnan(rssi_dbm).sum()} packets without RSSI; give all places an rssi_dbm"
-        )
+        count = np.isnan(rssi_dbm).sum()
+        raise DataError(f"{path}: {count} packets without RSSI; give all places an rssi_dbm")
     power_db = 10 * np.log10(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
     apart = rssi_dbm - power_db
     if np.std(apart) <= KEPT_DB:
@@ -194,3 +192,4 @@ class WifiCsi(Campaign):
     """Wi-Fi channels as cards log them; settings of `raw_of_wifi_csi` and `Campaign`."""
 
     choice, reader = "wifi_csi", staticmethod(raw_of_wifi_csi)
+    inside = "*.pcap"

@@ -43,6 +43,9 @@ NPZ = {
 }
 
 
+Pair = tuple[np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Log:
     """One end's packets: card's and computer's time [s], sender, counter, channel (n, 30, 3) [root of mW]."""
@@ -120,10 +123,8 @@ def read_log(path: Path) -> Log:
         raise DataError(f"{path}: missing; expected the log of each end of a run") from None
     records = np.frombuffer(content, RECORD, len(content) // RECORD.itemsize)  # the last may be cut short
     code, antennas, length = EXPECTED
-    right = (
-        (records["size"] == RECORD.itemsize - 2) & (records["code"] == code) & (records["length"] == length)
-    )
-    right &= (records["antennas"] == antennas).all(axis=1)
+    right = (records["size"] == RECORD.itemsize - 2) & (records["code"] == code)
+    right &= (records["length"] == length) & (records["antennas"] == antennas).all(axis=1)
     if not len(records) or not right.all():
         number = int(np.argmin(right)) if len(records) else 0
         fault = "expected packets of an Intel 5300 with three antennas, as the WSR toolbox logs them"
@@ -154,9 +155,7 @@ def _way(path: Path) -> np.ndarray:
         raise DataError(f"{path}: expected lines that begin with the time and end with x, y, z") from None
 
 
-def _link(
-    robot: Log, other: Log, way: np.ndarray, spacing_m: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator[Pair]:
     """Places (n, 3) and channels (n, 30) of each part of a run in which the root can be followed."""
     # A log does not name its own card: it is the sender with whose packets the oscillators cancel.
     tried = [_square(robot, other, sender) for sender in np.unique(robot.sender)]
@@ -223,3 +222,4 @@ class WSR(Campaign):
     """Channels of 30 tones of a robot that drives; settings of `raw_of_wsr` and `Campaign`."""
 
     choice, reader = "wsr", staticmethod(raw_of_wsr)
+    inside, marks = "**/csi_rx_*.dat", frozenset({"h2", "root_sign"})

@@ -28,14 +28,7 @@ FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less 
 LEAST_LISTED = 3  # stations, for lists of the strongest
 SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
 UNLISTED_EACH = 2  # rows of what is not listed for one that is
-STATION_FIELDS = (
-    "station",
-    "station_position",
-    "station_name",
-    "station_orientation",
-    *SECTOR,
-    "sensitivity_db",
-)
+STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", *SECTOR)
 
 
 def expand(check: Checker, measured: str) -> Links | None:
@@ -61,7 +54,7 @@ def expand(check: Checker, measured: str) -> Links | None:
 def _without_table(check: Checker, measured: str) -> Links | None:
     """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
     arrays = check.raw.arrays
-    for name in check.given(*STATION_FIELDS[:-1]):
+    for name in check.given(*STATION_FIELDS):
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     rows = len(arrays[measured]) if arrays[measured].ndim else 0
     run = _run(check, rows)
@@ -129,7 +122,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         if OTHER[moving] == "tx":
             return check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
         check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
-    for name in STATION_FIELDS[:-1]:
+    for name in STATION_FIELDS:
         check.raw.arrays.pop(name, None)
     if long and check.raw.attributes.get("absent") == "silent":
         links, of_level = _with_absent(check, measured, links)
@@ -153,18 +146,16 @@ def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np
     return links, station
 
 
-def _repeated(
-    check: Checker, links: Links, like: np.ndarray, station: np.ndarray, level: np.ndarray
-) -> Links:
-    """Rows `like` (n,), of stations (n,); the last of them have levels (m,) [dB] of their own."""
+def _repeated(check: Checker, links: Links, like: np.ndarray, of: np.ndarray, level: np.ndarray) -> Links:
+    """Rows `like` (n,), of stations `of` (n,); the last of them have levels (m,) [dB] of their own."""
     assert links.stations is not None and links.station is not None and links.place is not None
     arrays = take_rows(check.raw.arrays, like, len(links.station))
     levels = arrays["rssi_db"].astype(np.float64)
     levels[len(like) - len(level) :] = level
-    stand = {f"{links.static_end}_position": links.stations.position[station]}
+    stand = {f"{links.static_end}_position": links.stations.position[of]}
     check.raw = replace(check.raw, arrays={**arrays, "rssi_db": levels, **stand})
     run = None if links.run is None else links.run[like]
-    return replace(links, station=station, place=links.place[like], run=run)
+    return replace(links, station=of, place=links.place[like], run=run)
 
 
 def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[Links, np.ndarray]:
@@ -226,9 +217,7 @@ def _without_fix(check: Checker, measured: str) -> None:
     for name in ("latitude",) if degrees else check.given("rx_position", "tx_position"):
         pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
         rows = len(arrays[measured]) if arrays[measured].ndim else 0
-        if any(
-            part.ndim != 2 - degrees or len(part) != rows or part.dtype.kind not in "iuf" for part in pair
-        ):
+        if any(p.ndim != 2 - degrees or len(p) != rows or p.dtype.kind not in "iuf" for p in pair):
             continue
         place = np.column_stack(pair)[:, :2]
         null = (place == 0).all(axis=1)
@@ -432,9 +421,8 @@ def in_metres(check: Checker) -> Georeference | None:
             return check.refuse("station_latitude", "given without latitude and longitude of the other end")
         return _stated(check)
     if "station_position" in arrays:
-        return check.refuse(
-            "station_position", "in metres beside places in degrees; expected station_latitude"
-        )
+        fault = "in metres beside places in degrees; expected station_latitude"
+        return check.refuse("station_position", fault)
     places = {prefix: _read(check, prefix) for prefix in ("", "station_") if f"{prefix}latitude" in arrays}
     if len(check.problems) > before:
         return None
@@ -450,9 +438,8 @@ def in_metres(check: Checker) -> Georeference | None:
                 check.notes.append(f"no {name}_height: taken as 0 m")
             del arrays[f"{prefix}latitude"], arrays[f"{prefix}longitude"]
     check.notes += degree_warnings(*places[""])
-    check.notes.append(
-        f"positions are metres east and north of {origin.latitude:g}, {origin.longitude:g} degrees"
-    )
+    where = f"{origin.latitude:g}, {origin.longitude:g} degrees"
+    check.notes.append(f"positions are metres east and north of {where}")
     return origin
 
 

@@ -47,10 +47,8 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
     still: dict[End, bool] = {"rx": bool((rx == rx[:1]).all()), "tx": bool((tx == tx[:1]).all())}
     if still["rx"] or still["tx"]:
         return Links("rx" if still["rx"] else "tx", run=run)
-    places = {
-        "rx": np.unique(rx, axis=0, return_inverse=True),
-        "tx": np.unique(tx, axis=0, return_inverse=True),
-    }
+    ends = {"rx": rx, "tx": tx}
+    places = {end: np.unique(where, axis=0, return_inverse=True) for end, where in ends.items()}
     few: End = min(("tx", "rx"), key=lambda end: len(places[end][0]))  # type: ignore[assignment]
     table, which = places[few]
     if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
@@ -86,9 +84,8 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     turned = check.real("station_orientation", (count, 4))
     if turned is not None and not is_unit(turned).all():
         row = int(np.flatnonzero(~is_unit(turned))[0])
-        return check.refuse(
-            "station_orientation", f"row {row}: expected a quaternion (w, x, y, z) of length 1"
-        )
+        fault = f"row {row}: expected a quaternion (w, x, y, z) of length 1"
+        return check.refuse("station_orientation", fault)
     rotation = None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
     parts = [check.real(name, (count,)) for name in SECTOR]
     sector = None
@@ -107,9 +104,8 @@ def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
         return None
     out = np.flatnonzero((index < 0) | (index >= count))
     if len(out):
-        return check.refuse(
-            "station", f"row {out[0]} is of station {index[out[0]]}; there are 0 to {count - 1}"
-        )
+        fault = f"row {out[0]} is of station {index[out[0]]}; there are 0 to {count - 1}"
+        return check.refuse("station", fault)
     return index.astype(np.int64)
 
 
@@ -149,9 +145,8 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
         of_link = carriers[station]
     else:
         if len(carriers) == len(stations) and len(np.unique(carriers)) > 1:
-            check.notes.append(
-                "carrier_hz: as many values as rows and as stations; taken as one for each row"
-            )
+            said = "as many values as rows and as stations; taken as one for each row"
+            check.notes.append(f"carrier_hz: {said}")
         of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
     of_link = _of_one(check, station, of_link, stations.name) if hopping else of_link
     pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)

@@ -42,6 +42,9 @@ def moments(place: np.ndarray, station: np.ndarray) -> np.ndarray:
     return result
 
 
+Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Lists:
     """Lists of the strongest of T stations.
@@ -59,14 +62,12 @@ class Lists:
     place: np.ndarray
 
     @classmethod
-    def of(
-        cls, moment: np.ndarray, station: np.ndarray, level: np.ndarray, place: np.ndarray, count: int
-    ) -> Lists:
-        """Of rows (n,) of lists `moment`, `count` stations, levels [dB] and places (n, 3) [m]."""
-        number, first, which = np.unique(moment, return_index=True, return_inverse=True)
+    def of(cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int) -> Lists:
+        """Of rows (n,) of `lists`, stations `who` of `count`, levels [dB] and places `at` (n, 3) [m]."""
+        number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
-        table[which.reshape(-1), station] = level
-        return cls(int(np.isfinite(table).sum(1).max()), first, table, place[first])
+        table[which.reshape(-1), who] = level
+        return cls(int(np.isfinite(table).sum(1).max()), first, table, at[first])
 
     @property
     def full(self) -> np.ndarray:
@@ -89,9 +90,7 @@ class Lists:
         above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
-    def unlisted(
-        self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
         """Moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import yaml
 from filelock import FileLock
 
 from gsparc.data.errors import DataError, nearest, reason
-from gsparc.data.files import platform_cache
+from gsparc.data.files import platform_cache, shipped
 
 log = logging.getLogger(__name__)
 
@@ -90,12 +89,11 @@ class PublicSet:
 @cache
 def public_sets() -> dict[str, PublicSet]:
     """Every public set by its name."""
-    here = files("gsparc.data.public")
     sources: dict[str, list[Source]] = {}
-    for row in csv.DictReader(here.joinpath("sources.csv").read_text(encoding="utf-8").splitlines()):
+    for row in shipped("gsparc.data.public", "sources.csv"):
         place = row["repository"], row["revision"], row["path"]
         sources.setdefault(row["dataset"], []).append(Source(*place, int(row["bytes"]), row["sha256"]))
-    about = yaml.safe_load(here.joinpath("sets.yaml").read_text(encoding="utf-8"))
+    about = yaml.safe_load(files("gsparc.data.public").joinpath("sets.yaml").read_text(encoding="utf-8"))
     sets = {}
     for name, facts in about.items():
         pinned, match = sources.get(facts.pop("of", name), ()), facts.pop("match", "*")
@@ -119,9 +117,8 @@ def fetched(choice: str, setting: str = "file") -> Path:
         by_hand = [f"get it from {one.by_hand} and " for one in sets]
         raise DataError(f"dataset.{setting} is not set; {''.join(by_hand)}{say}")
     part = f", of which {len(missing)} are missing" if len(missing) < len(here.sources) else ""
-    raise DataError(
-        f"dataset.{setting} is not set; get it with `gsparc data {here.name}` ({here.size}{part}), or {say}"
-    )
+    how = f"get it with `gsparc data {here.name}` ({here.size}{part})"
+    raise DataError(f"dataset.{setting} is not set; {how}, or {say}")
 
 
 def found(choice: str) -> Path | None:

@@ -15,17 +15,16 @@ import pandas as pd
 from gsparc.data.errors import Caution, some
 from gsparc.data.tables.heads import (
     AXES,
-    BESIDE,
     END_WORDS,
     ENDS,
     KINDS,
-    LABELS,
+    LISTS,
     MANY,
     OTHER_NAMES,
     PERCENT,
+    SHEET,
     STATION_WORDS,
     TOGETHER,
-    TOPICS,
     Head,
     about,
     suits,
@@ -40,20 +39,10 @@ LEVELS = ("rssi_db", "rssi")
 CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS, POLAR)
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
-ONE_OF = (
-    MEASURED,
-    *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS),
-)
-# Beside the word for a level: which radio, antenna or cell it is of.
-PLAIN = {
-    *("wifi", "wlan", "lte", "nr", "5g", "gsm", "umts", "ble", "bluetooth", "lora", "zigbee"),
-    *("uwb", "serving", "dl"),
-}
-STATION = re.compile(
-    r"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|"
-    + "|".join(sorted(STATION_WORDS))
-    + r")?[\W_]*\d+)[\W_]*$"
-)
+ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
+LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
+_STATIONS = "|".join(sorted(STATION_WORDS))
+STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -115,7 +104,7 @@ def choose(
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
-        areas = TOGETHER[meaning.word] if meaning.word in BESIDE else set()
+        areas = TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
         alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
         if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
             continue
@@ -172,7 +161,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
     """A station's column and those that tell it from others of its name, `always` or where some do."""
     for first in candidates:
         parts = TOGETHER.get(first.word, set())
-        bare = {head: set(words_of(head)) - {*LABELS, *PLAIN} for head in sheet.heads if head != first.head}
+        bare = {head: set(words_of(head)) - LESS for head in sheet.heads if head != first.head}
         more = [head for head, words in bare.items() if words and words <= parts]
         if not parts or not all(column is first or column.head in more for column in candidates):
             continue
@@ -187,7 +176,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
 
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
-NAMED = re.compile(rf"(?i)^[\W_]*({'|'.join(sorted(STATION_WORDS))})[\W_]*[a-z]?\d+[\W_]*$")
+NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS})[\W_]*[a-z]?\d+[\W_]*$")
 
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
@@ -222,7 +211,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
         groups = len({name for name, _ in pairs}) if wanted != "z" else 1
         if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
             joined = "+".join([*(column.head or "" for column in stations), head])
-            how = TOPICS[topic].format(head=head, joined=joined)
+            how = SHEET["remedies"][topic].format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
     return notes
 
@@ -308,7 +297,8 @@ def _is_plain(column: Column, stations: Container[str]) -> bool:
     """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
     absolute = column.unit is not None and column.unit.name != "dB"
     named = column.label in stations or re.fullmatch(r"\W*", column.label)
-    return bool(absolute or named or set(words_of(column.label)) <= PLAIN or STATION.search(column.label))
+    plain = set(words_of(column.label)) <= LISTS["plain"]
+    return bool(absolute or named or plain or STATION.search(column.label))
 
 
 def _one_unit(sheet: Sheet, chosen: Chosen) -> None:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from importlib.resources import files
+from typing import Any
+
+import yaml
 
 from gsparc.data.units import UNITS, Unit
 
@@ -26,68 +30,19 @@ MANY = ("rssi_db", "rssi", "csi_re", "csi_im", "csi_amp", "csi_phase")
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
-END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
+
+def by_word(table: str) -> dict[str, str]:
+    """Which entry of a table of words.yaml each of its words stands for."""
+    return {word: meaning for meaning, words in SHEET[table].items() for word in words.split()}
 
 
-def _words(text: str) -> set[str]:
-    return set(text.split())
-
-
-def _by_word(table: dict[str, str]) -> dict[str, str]:
-    """Which entry of a table each word of its texts stands for."""
-    return {word: meaning for meaning, words in table.items() for word in words.split()}
-
-
-STATION_WORDS = _words(
-    "station site tower mast sensor gateway gw gtw bs cell enb enodeb gnb ap wap anchor pci psc bsic bssid "
-    "netid cid ci eci nci cgi sector beacon"
-)
-BESIDE = ("ci",)  # of a station only beside a word of its area: it may be a confidence interval
-LESS = ("mac", "eui")  # of a station where nothing else names it
-# Columns whose values together name a station: the first is unique only beside one of the second.
-TOGETHER = {
-    word: set(parts.split())
-    for words, parts in (
-        ("pci psc bsic", "earfcn arfcn uarfcn nrarfcn dlarfcn channel freq frequency"),
-        ("cell cid ci sector", "lac tac area enb enodeb gnb site"),
-        ("bssid mac ap netid", "band"),
-    )
-    for word in words.split()
-}
-_AXIS = _by_word({"x": "x easting", "y": "y northing", "z": "z height hgt alt altitude elevation elev"})
-_AXIS |= _by_word({"latitude": "lat latitude", "longitude": "lon lng long longitude"})
-_PLACE = _words(
-    "position pos coordinate coord location loc gps gnss local wgs84 utm current device user phone reading "
-    "measured decimal"
-)
-# Above what: heights that differ by a constant.
-_ABOVE = _words(
-    "msl amsl asl agl above sea sealevel level ground takeoff relative rel baro barometric ellipsoid "
-    "ellipsoidal geoid orthometric mean"
-)
-# What an unused column may speak of, and what to do with it.
-TOPICS = {
-    "a floor": "z={head}*3.2 takes 3.2 m a floor, .station={joined} a station for each",
-    "a height": "z={head} takes it",
-    "a station": "station={joined} tells them apart",
-    "a carrier": "carrier_hz={head} takes it, in Hz",
-}
-_TOPIC = dict.fromkeys((*STATION_WORDS, *LESS, "earfcn", "lac", "tac", "band"), "a station")
+SHEET: dict[str, Any] = yaml.safe_load(files(__package__).joinpath("words.yaml").read_text(encoding="utf-8"))
+LISTS = {name: set(words.split()) for name, words in SHEET.items() if isinstance(words, str)}
+STATION_WORDS, END_WORDS = LISTS["station"], by_word("ends")
+TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
+_AXIS, _PART = by_word("axes"), by_word("part")
+_TOPIC = dict.fromkeys(STATION_WORDS | LISTS["less"], "a station") | by_word("topics")
 _TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
-_TOPIC |= _by_word({"a carrier": "frequency freq carrier channel", "a floor": "floor storey etage"})
-_ACCURACY = {"accuracy", "error", "std", "dop", "valid", "quality", "count"}
-LEVEL_WORDS = _words("rssi rsrp rss rxlev power level signal prx rscp")
-_ABOUT_LEVEL = _words("rx received receive strength signal mean avg average median measured value")
-NO_LEVEL = _words(
-    "tx transmit transmitted eirp noise std stdev var min max count loss delay angle interference quality "
-    "headroom class control delta diff difference change error residual offset threshold limit predicted "
-    "prediction estimated expected simulated gain battery supply pathloss attenuation bars rsrq snr sinr cqi "
-    "lsnr ber"
-)
-LABELS = _words("name id ids nr no number index mac eui address addr label code")
-_CHANNEL = ("csi", "h", "channel", "cfr")
-_PART = _by_word({"csi_re": "re real i", "csi_im": "im imag q", "csi_phase": "phase arg"})
-_PART |= _by_word({"csi_amp": "amp amplitude mag magnitude abs"})
 
 
 @dataclass(frozen=True)
@@ -112,9 +67,10 @@ class Head:
 
 
 def about(head: str) -> str | None:
-    """Of which of `TOPICS` a head speaks; None: of none."""
+    """Of which of the topics a head speaks; None: of none."""
     words = words_of(unit_of(head)[0])
-    return None if _ACCURACY & set(words) else next((_TOPIC[word] for word in words if word in _TOPIC), None)
+    topics = (_TOPIC[word] for word in words if word in _TOPIC)
+    return None if LISTS["accuracy"] & set(words) else next(topics, None)
 
 
 def understand(text: str) -> Head:
@@ -163,7 +119,7 @@ def words_of(text: str) -> list[str]:
 
 
 def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
-    rest = [word for word in words if word not in _PLACE]
+    rest = [word for word in words if word not in LISTS["place"]]
     joined = "_".join(rest)
     if joined in KINDS and joined != "rssi":  # which is watts in the schema, but dBm in most logs
         return Head(joined, unit=unit, word=joined)
@@ -176,7 +132,7 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
     axes = [word for word in rest if word in _AXIS]
     above = len(axes) == 1 and _AXIS[axes[0]] == "z"
-    ends = [word for word in rest if word not in _AXIS and not (above and word in _ABOVE)]
+    ends = [word for word in rest if word not in _AXIS and not (above and word in LISTS["above"])]
     less = len(ends) + len(axes) < len(rest)
     if len(axes) != 1 or len(ends) > 1:
         return None
@@ -187,12 +143,12 @@ def _axis(rest: list[str], unit: Unit | None) -> Head | None:
 
 
 def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
-    named = [word for word in words if word in LEVEL_WORDS]
-    if not named or any(word in NO_LEVEL for word in words):
+    named = [word for word in words if word in LISTS["level"]]
+    if not named or LISTS["no_level"] & set(words):
         return None
     # 'signal strength' and 'signal power' are one thing said twice.
     word = next((w for w in named if w != "signal"), "signal")
-    rest = [w for w in words if w != word and w not in _ABOUT_LEVEL and w not in ("db", "dbm")]
+    rest = [w for w in words if w != word and w not in LISTS["about_level"] and w not in ("db", "dbm")]
     label = ""
     if rest:
         # One mark between the level and the name: a sign or # after it is the name's.
@@ -206,8 +162,8 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
 def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
     parts = [word for word in words if word in _PART]
-    others = [word for word in words if word not in _PART and not word.isdigit() and word not in _CHANNEL]
-    named = any(word in _CHANNEL for word in words)
+    others = [word for word in words if word not in {*_PART, *numbers, *LISTS["channel"]}]
+    named = bool(LISTS["channel"] & set(words))
     plainly = ("re", "im", "real", "imag", *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers))
     if len(parts) != 1 or not (named or parts[0] in plainly):
         return None
@@ -223,13 +179,13 @@ def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
 
 
 def _text(words: list[str], unit: Unit | None) -> Head:
-    rest = [word for word in words if word not in LABELS]
+    rest = [word for word in words if word not in LISTS["labels"]]
     if len(rest) == 1 and rest[0] in STATION_WORDS:
         return Head("station", word=rest[0])
-    if not rest and set(words) & set(LESS):
-        return Head("station", word=next(word for word in words if word in LESS), less=True)
+    if not rest and set(words) & LISTS["less"]:
+        return Head("station", word=next(word for word in words if word in LISTS["less"]), less=True)
     if rest == ["run"]:
         return Head("run", word="run")
-    if rest and all(word in ("frequency", "freq", "carrier", "fc", "center", "centre") for word in rest):
+    if rest and set(rest) <= LISTS["carrier"]:
         return Head("carrier_hz", unit=unit, word=rest[-1])
     return Head()

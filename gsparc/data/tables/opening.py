@@ -115,10 +115,9 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     width = len(_cells(lines[min(lines)], delimiter))
     if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
-        fault = (
-            f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,} cells"
-        )
-        raise DataError(f"{source}: {fault} are read: write Parquet, with dataset.cell_m where rows are many")
+        fault = f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,}"
+        how = "write Parquet, with dataset.cell_m where rows are many"
+        raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
     lines, again_notes = _heads_once(lines)
@@ -155,9 +154,8 @@ def _decoded(path: Path) -> tuple[str, str]:
         except UnicodeDecodeError as error:
             raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
     if b"\0" in content:
-        raise DataError(
-            f"{path}: not text (byte {content.index(0)} is zero; UTF-16 without its mark?); save it as UTF-8"
-        )
+        why = f"byte {content.index(0)} is zero; UTF-16 without its mark?"
+        raise DataError(f"{path}: not text ({why}); save it as UTF-8")
     try:
         return content.decode("utf-8-sig"), "UTF-8"
     except UnicodeDecodeError:

@@ -29,7 +29,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     station_names,
 )
-from gsparc.data.tables.heads import PERCENT, words_of
+from gsparc.data.tables.heads import LISTS, PERCENT, words_of
 from gsparc.data.tables.opening import read_parquet, sheet_of
 from gsparc.data.tables.places import (
     PER_STATION,
@@ -93,7 +93,6 @@ def understand_table(
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
-HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
 
 
 class Builder:
@@ -191,9 +190,8 @@ class Builder:
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
                 self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
             elif tones.setdefault(int(label or 0), column) is not column:
-                self.sheet.problems.add(
-                    where, f"the same tone as {tones[int(label or 0)].head!r}; rename one"
-                )
+                other = tones[int(label or 0)].head
+                self.sheet.problems.add(where, f"the same tone as {other!r}; rename one")
         return tones
 
     def _ends(self, measured: str | None) -> None:
@@ -206,9 +204,8 @@ class Builder:
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .latitude, .longitude")
         if len(ends) == 3:
-            return self.refuse(
-                "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"
-            )
+            fault = "coordinates of rx, of tx and of an end without a name"
+            return self.refuse(f"{fault}; expected two ends, rename one")
         stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
@@ -258,7 +255,7 @@ class Builder:
             named = named or [stay] * bool(stay)
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
-            if not named and station and station[0].word in HEARING:
+            if not named and station and station[0].word in LISTS["hearing"]:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
@@ -283,9 +280,8 @@ class Builder:
             if self.listed is not None and len(self.listed.names) == 1:
                 return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
             if self.listed is not None:
-                return self.refuse(
-                    "no column says which station a row is of; say dataset.columns.station=COLUMN"
-                )
+                fault = "no column says which station a row is of"
+                return self.refuse(f"{fault}; say dataset.columns.station=COLUMN")
             if where is None:
                 where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
@@ -396,9 +392,8 @@ class Builder:
         """Stations told apart by their places alone."""
         values, index = np.unique(where.all(), axis=0, return_inverse=True)
         if len(values) > max(1, len(self.sheet) // 2):
-            return self.refuse(
-                f"{len(values)} places of stations in {len(self.sheet)} rows; stations stay where they are"
-            )
+            fault = f"{len(values)} places of stations in {len(self.sheet)} rows"
+            return self.refuse(f"{fault}; stations stay where they are")
         each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
         names = tuple(f"station {i}" for i in range(len(values)))
         return StationList(names, each, index=index.reshape(-1))
@@ -406,9 +401,8 @@ class Builder:
     def _add_stations(self, stations: StationList, degrees: bool) -> None:
         if stations.places.degrees != degrees:
             words = ("degrees", "metres") if degrees else ("metres", "degrees")
-            return self.refuse(
-                f"the places of rows are in {words[0]}, those of stations in {words[1]}; expected one of them"
-            )
+            fault = f"the places of rows are in {words[0]}, those of stations in {words[1]}"
+            return self.refuse(f"{fault}; expected one of them")
         self.arrays["station_name"] = np.array(stations.names)
         if stations.index is not None:
             self.arrays["station"] = stations.index.astype(np.int64)
@@ -473,9 +467,8 @@ class Builder:
         values = column.numbers(self.sheet)
         if values is None:
             return
-        self.sheet.refuse_rows(
-            column.head, np.flatnonzero(np.isnan(values)), "no value; expected a frequency"
-        )
+        unknown = np.flatnonzero(np.isnan(values))
+        self.sheet.refuse_rows(column.head, unknown, "no value; expected a frequency")
         if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
             values = 1e6 * values
             self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")

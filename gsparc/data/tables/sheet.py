@@ -6,21 +6,15 @@ import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import Problems
-from gsparc.data.tables.heads import PERCENT, UNITS, Unit
+from gsparc.data.tables.heads import PERCENT, SHEET, UNITS, Unit
 
-if TYPE_CHECKING:
-    pass
-
-# What stands for no value, in small letters.
-MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "#n/a", "null", "none", "nil", "?", ".")
-# What stands for "not heard" in a cell of a level, however rare; other text does where it repeats.
-NOT_HEARD = re.compile(r"n\.?[pdh]\.?|oor|-inf|not? (?:heard|signal|detected|service|coverage)")
+NOT_HEARD = re.compile(SHEET["not_heard"])
 REPEATS = 3
 MEASURED = re.compile(r"\s*([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)\s*", re.IGNORECASE)
 SEXAGESIMAL = re.compile(
@@ -78,7 +72,7 @@ class Sheet:
         if pd.api.types.is_float_dtype(column.dtype) and (column[~missing] % 1 == 0).all():
             column = column.astype("Int64")  # 212, not 212.0: a name that was read as a number
         text = column.astype(str).str.strip().to_numpy(dtype=object)
-        empty = missing | np.isin(np.char.lower(text.astype(str)), MISSING)
+        empty = missing | np.isin(np.char.lower(text.astype(str)), SHEET["missing"])
         return np.where(empty, "", text).astype(str)
 
     def numbers(

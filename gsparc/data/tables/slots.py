@@ -9,15 +9,10 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import some
-from gsparc.data.tables.heads import unit_of, words_of
+from gsparc.data.tables.heads import by_word, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 
-# Words of a head that say what of a slot it holds; all others name the slot.
-HOLDS = {
-    **dict.fromkeys(("pci", "psc", "bsic", "cellid", "eci", "nci"), "PCI"),
-    **dict.fromkeys(("earfcn", "arfcn", "uarfcn", "nrarfcn"), "EARFCN"),
-    **dict.fromkeys(("rsrp", "rscp", "rxlev"), "RSRP"),
-}
+HOLDS = by_word("slots")
 NEEDED, LEAST = {"PCI", "RSRP"}, 2  # of a slot; slots
 
 
@@ -56,9 +51,8 @@ def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     for slot in slots.values():
         held = np.flatnonzero((sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != ""))
         heads = {part: slot.get(part, shared) if part == "EARFCN" else slot[part] for part in names}
-        parts.append(
-            pd.DataFrame({names[part]: columns[head].iloc[held].to_numpy() for part, head in heads.items()})
-        )
+        series_of = {names[part]: columns[head].iloc[held].to_numpy() for part, head in heads.items()}
+        parts.append(pd.DataFrame(series_of))
         rows.append(held)
     row = np.concatenate(rows)
     order = np.argsort(row, kind="stable")

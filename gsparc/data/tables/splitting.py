@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.data.tables.heads import LEVEL_WORDS, NO_LEVEL, about, words_of
+from gsparc.data.tables.heads import LISTS, about, words_of
 
 MOST_GROUPS, MOST_CELLS = 12, 4  # values of a column that may tell stations apart, and cells far apart
 LEAST_APART_DB = 6.0  # beyond what levels of one group differ by between neighbours
@@ -32,7 +32,8 @@ def splitting(
     """
     for head, words in columns.items():
         values, group = np.unique(words, return_inverse=True)
-        if about(head) or (NO_LEVEL | LEVEL_WORDS) & set(words_of(head)) or len(values) > MOST_GROUPS:
+        of_level = (LISTS["no_level"] | LISTS["level"]) & set(words_of(head))
+        if about(head) or of_level or len(values) > MOST_GROUPS:
             continue
         known, group = np.isfinite(level) & (words != ""), group.reshape(-1)
         every = [np.flatnonzero(known & (station == one)) for one in np.unique(station)]

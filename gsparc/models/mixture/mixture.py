@@ -32,7 +32,7 @@ class Mixture(ClosedForm, kind="mixture"):
     """The weighed mean of members: no single one need be the right one.
 
     Args:
-        parts: names in `CANDIDATES` that `fit` tries.
+        names: of `CANDIDATES` that `fit` tries.
         init: their settings.
         effects: switches of terms, of which `visibility` and `residual` are heeded.
     """
@@ -41,10 +41,10 @@ class Mixture(ClosedForm, kind="mixture"):
     has_gaussians = True
 
     def __init__(
-        self, parts: Sequence[str] = (), init: InitSettings | None = None,
+        self, names: Sequence[str] = (), init: InitSettings | None = None,
         effects: EffectSettings = EffectSettings(),
     ) -> None:  # fmt: skip
-        self.tried, self.init, self.effects_tried = tuple(parts), init or InitSettings(), effects
+        self.tried, self.init, self.switches = tuple(names), init or InitSettings(), effects
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
@@ -60,6 +60,12 @@ class Mixture(ClosedForm, kind="mixture"):
         return result
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """See `weighed`."""
+        return self.weighed(self.tried, self.init, data, fold, context)
+
+    def weighed(
+        self, names: Sequence[str], init: InitSettings, data: Measurements, fold: Fold, context: FitContext
+    ) -> FitReport:
         """Fit every candidate, weigh them by rows held out where they are several, condition on all rows.
 
         Raises:
@@ -67,13 +73,11 @@ class Mixture(ClosedForm, kind="mixture"):
         """
         budget = context.time_budget()
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
-        log.info(
-            "training a Gaussian field with closed-form weights: init=%s%s", " and ".join(self.tried), end
-        )
-        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(self.tried) > 1
+        log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(names), end)
+        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(names) > 1
         cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
         found, reports, read = solutions.find(
-            self.tried, self.init, self.effects_tried, data, fold, context, budget, cut
+            tuple(names), init, self.switches, data, fold, context, budget, cut
         )
         chosen = solutions.weighed(found, data, fold, cut)
         heeded.count(*(path for name in chosen for path in read[name]))

@@ -33,6 +33,7 @@ from gsparc.models.peers.gaussians import (
 )
 from gsparc.models.peers.trained import Scene
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
+from gsparc.training.losses import task_loss
 
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
@@ -86,10 +87,11 @@ class ComplexGaussians(GaussianNetwork):
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
-        plain = super().loss(batch, draw)
+        seen = self(batch.tx, batch.rx)
+        plain = task_loss(seen, batch, self.ssim_weight).mean()
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
-        difference = torch.fft.rfft2(self(batch.tx, batch.rx) - batch.target, norm="ortho").abs().mean()
+        difference = torch.fft.rfft2(seen - batch.target, norm="ortho").abs().mean()
         return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:

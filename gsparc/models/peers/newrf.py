@@ -75,11 +75,8 @@ class NeWRF(TrainedPeer):
         centres, seen = virtual_transmitters(places, rays)
         if not len(centres):
             raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
-        return {
-            "places": torch.from_numpy(places).float(),
-            "virtual": torch.from_numpy(centres).float(),
-            "votes": votes(seen, len(centres)),
-        }
+        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
+        return {**found, "votes": votes(seen, len(centres))}
 
     def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""

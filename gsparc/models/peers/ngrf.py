@@ -68,8 +68,8 @@ class Radiators(Network):
         antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN
         means = low + (high - low) * torch.rand(count, 3)
-        if scene.transmitter is not None:
-            means[0] = scene.transmitter + TRANSMITTER_SPREAD * torch.randn(3)
+        if scene.site.static_end == "tx" and scene.site.static_position is not None:
+            means[0] = torch.from_numpy(scene.site.static_position) + TRANSMITTER_SPREAD * torch.randn(3)
         self.means = nn.Parameter(means)
         self.log_extents = nn.Parameter(torch.full((count,), math.log(0.05)))
         self.gains = nn.Parameter(torch.randn(count, 2) * scene.reach / math.sqrt(2 * count))
@@ -97,7 +97,7 @@ class Radiators(Network):
         distance = (offset.square().sum(-1) + (2 * self.log_extents).exp()).sqrt()
         strength = torch.view_as_complex(self.gains) / distance
         waves = torch.polar(torch.ones(()), -distance.unsqueeze(-1) * self.wavenumbers)
-        arriving = torch.einsum("bn,bnk,na->bak", strength, waves, torch.view_as_complex(self.antennas))
+        arriving = torch.view_as_complex(self.antennas).mT @ (strength.unsqueeze(-1) * waves)
         if self.steering is None:
             return arriving
         image = bartlett(arriving[..., 0], self.steering)

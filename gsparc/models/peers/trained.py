@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, ClassVar
 
 import lightning.pytorch as L
@@ -13,15 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.datamodule import order
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
+from gsparc.models.parts import Origin
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.losses import channel_loss, spectrum_loss
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.fit import run_stage, steps_asked_for
+from gsparc.training.losses import task_loss
+from gsparc.training.module import NetworkModule
+from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
@@ -37,24 +40,26 @@ class Scene:
     Attributes:
         site: the fixed facts.
         shape: of one target: (H, W), (antennas, subcarriers) or (1,).
-        receiver: pose of the static receiver; None when it moves.
-        transmitter: (3,) [m], the static transmitter; None when it moves.
         box: (2, 3) float32 [m], lower and upper corner of the moving end's training positions.
     """
 
     site: Site
     shape: tuple[int, ...]
-    receiver: Pose | None
-    transmitter: Tensor | None
     box: Tensor
+
+    @property
+    def receiver(self) -> Pose | None:
+        """Pose of the static receiver; None when it moves."""
+        if self.site.static_end == "tx" or self.site.static_position is None:
+            return None
+        turn = np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+        return Pose(*(torch.from_numpy(one).float() for one in (self.site.static_position, turn)))
 
     @property
     def reach(self) -> float:
         """Extent of the scene [m]: from the static end to the far side of the box."""
-        low, high = self.box
-        still = self.receiver.position if self.receiver is not None else self.transmitter
-        middle = (low + high) / 2
-        apart = 0.0 if still is None else float((still - middle).norm())
+        still, (low, high) = self.site.static_position, self.box
+        apart = 0.0 if still is None else float((torch.from_numpy(still) - (low + high) / 2).norm())
         return max(apart + float((high - low).norm()) / 2, 1.0)
 
 
@@ -74,12 +79,7 @@ class Network(nn.Module):
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Training loss () of a batch; `draw` for whatever is drawn at random."""
-        prediction = self(batch.tx, batch.rx)
-        if prediction.is_complex():
-            return channel_loss(prediction, batch.target, batch.mask).mean()
-        if batch.mask is not None:
-            prediction = torch.where(batch.mask, prediction, batch.target)
-        return spectrum_loss(prediction, batch.target, self.ssim_weight).mean()
+        return task_loss(self(batch.tx, batch.rx), batch, self.ssim_weight).mean()
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
@@ -110,6 +110,7 @@ class TrainedPeer(Method):
         name: as it appears in tables.
     """
 
+    resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
     step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare/cells)
@@ -142,62 +143,47 @@ class TrainedPeer(Method):
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train to the end of the schedule, or of the seconds.
+        """Train to the end of the schedule, or of the seconds; steps of the Trainer win over the model's.
 
         Raises:
-            ValueError: a kind of data the method does not serve, or no training rows.
+            ValueError: a kind of data the method does not serve, no rows, or a run of others to resume.
             RuntimeError: the loss became NaN or infinite.
         """
         assert self.budget_s is not None
-        limit = self.budget_s if self.max_steps else SLACK * self.budget_s
-        budget, kinds = TimeBudget(limit, "processor"), tuple(self.step_s)
+        kinds, kind = tuple(self.step_s), data.site.kind
         rows = np.sort(np.concatenate([fold.train, fold.val]))
-        if data.site.kind not in kinds:
-            raise ValueError(
-                f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {data.site.kind}"
-            )
+        if kind not in kinds:
+            raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
+        origin = Origin.of(data, fold, context)
+        context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
+        asked = steps_asked_for(context, len(rows), self.max_steps)
+        budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
         self.network = self.build(_scene(data, rows), self.precomputed)
-        self._train(data, rows, budget)
+        if context.resume is not None:
+            origin.refuse_other(interrupted(context.resume))
+        own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
+        module = self.module(max(round(own), 1) if asked is None else asked, context.run_dir)
+        files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
+        ran = run_stage(module, data, Fold(rows, rows[:0], fold.test), context, files, budget)
+        self.steps = ran.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        return FitReport(budget.counted.wall, (note,), budget.limited_by)
+        limited_by = less_repeatable(budget.limited_by, "wall" if ran.timed_out else None)
+        return FitReport(budget.counted.wall, (note,), limited_by)
 
-    def _train(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> None:
-        network = self.fitted()
-        optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
-        base = [group["lr"] for group in optimizer.param_groups]
-        draw = torch.Generator().manual_seed(self.seed)
-        total = self.max_steps or self._steps_within(data.site.kind)
-        for step in range(total):
-            if step and budget.over():
-                break
-            for group, rate in zip(optimizer.param_groups, base, strict=True):
-                group["lr"] = rate * rate_factor(step / total)
-            batch = data.batch(order(self.seed, step, self.batch_size, rows))
-            optimizer.zero_grad(set_to_none=True)
-            loss = network.loss(batch, draw)
-            if not torch.isfinite(loss):
-                raise RuntimeError(
-                    f"{self.name}: the loss became NaN or infinite at step {step}; lower model.rate"
-                )
-            loss.backward()
-            optimizer.step()
-            self.steps = step + 1
+    def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
+        """What Lightning trains, with a schedule of `steps`."""
+        network, warmup = self.fitted(), max(round(WARMUP * steps), 1)
+        rates = OptimizerSettings(decay=FINAL_RATE, warmup=warmup)
+        return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_of)
 
-    def _steps_within(self, kind: Kind) -> int:
-        """Steps that the seconds hold by `step_s`; of other batches in proportion."""
-        assert self.budget_s is not None
-        return max(round(self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size), 1)
-
-    def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
-        for name, parameter in network.named_parameters():
-            known = [prefix for prefix in self.rates if name.startswith(prefix)]
-            rate = self.rates[max(known, key=len)] if known else self.rate
-            yield {"params": [parameter], "lr": rate}
+    def _rate_of(self, name: str) -> tuple[str, float]:
+        kind = max((known for known in self.rates if name.startswith(known)), key=len, default="other")
+        return kind, self.rates.get(kind, self.rate)
 
     def fitted(self) -> Network:
         """The network; `ValueError` before `fit` or `restore`."""
@@ -223,34 +209,19 @@ class TrainedPeer(Method):
     def state(self) -> dict[str, Any]:
         """Weights, and what the network is built from."""
         network = self.fitted()
-        scene, receiver = network.scene, network.scene.receiver
-        return {
-            "shape": list(scene.shape),
-            "receiver": None if receiver is None else [receiver.position, receiver.rotation],
-            **{"transmitter": scene.transmitter, "box": scene.box, "found": self.precomputed},
-            **{"network": network.state_dict(), "steps": self.steps},
-        }
+        scene = {"shape": list(network.scene.shape), "box": network.scene.box, "found": self.precomputed}
+        return {**scene, "network": network.state_dict(), "steps": self.steps}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        receiver = None if state["receiver"] is None else Pose(*state["receiver"])
-        self.site = site
-        scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
+        self.site, scene = site, Scene(site, tuple(state["shape"]), state["box"])
         self.precomputed, self.steps = dict(state["found"]), int(state["steps"])
         self.network = self.build(scene, self.precomputed)
         self.network.load_state_dict(state["network"])
         self.network.eval()
 
 
-def rate_factor(progress: float) -> float:
-    """Learning rate at a share of the training in [0, 1], relative to the largest: a rise, then a cosine."""
-    rise = min((progress + 1e-3) / WARMUP, 1.0)
-    return rise * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
-
-
 def _scene(data: Measurements, rows: np.ndarray) -> Scene:
-    one, moving = data.batch(rows[:1]), data.moving[rows]
+    moving = data.moving[rows]
     box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
-    static = data.site.static_end == "rx"
-    ends = (one.rx, None) if static else (None, one.tx[0])
-    return Scene(data.site, tuple(data.target.shape[1:]), *ends, box)  # type: ignore[call-arg]
+    return Scene(data.site, tuple(data.target.shape[1:]), box)

@@ -47,9 +47,10 @@ class GsparcCheckpointIO(CheckpointIO):
         self.method, self.config_yaml, self.marks = method, config_yaml, dict(marks)
 
     def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write atomically."""
+        """Write atomically; nowhere where a fit has no folder."""
         extra = {"trainer": trainer_state, **self.marks}
-        checkpoint.save(Path(path), self.method, self.config_yaml, extra)
+        if Path(path).parent != Path():
+            checkpoint.save(Path(path), self.method, self.config_yaml, extra)
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None

@@ -14,6 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import check_arguments, or_word, switch, whole
 from gsparc.data.query import Query
@@ -271,6 +272,7 @@ class LearnedField(Method):
             watch.append(KeepBest())
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
+        heeded.count("dataset.batch_size")
         ran = run_stage(module, data, fold, context, files, budget, watch)
         self.steps = ran.taken if ran.kept is None else ran.kept
         self.spent["gradient steps" + again] = ran.seconds

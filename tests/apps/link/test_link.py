@@ -24,7 +24,7 @@ from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
 from gsparc.prediction.channels import centred, interpolated, resource_grid
-from gsparc.prediction.risk_threshold import binomial_interval
+from gsparc.prediction.risk import binomial_interval
 from gsparc.training.context import FitContext
 
 needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")

@@ -16,7 +16,6 @@ from measured import (
     MAKERS,
     STATIONS,
     TABLE,
-    ble_arrays,
     channels_of,
     powder_arrays,
     release_variables,
@@ -167,21 +166,6 @@ def test_powder_csv_holds_the_same(tmp_path):
     assert "3 columns left out, no fixed place: bus-6186_rss" in table.attributes["left_out"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("-101", ""),
-        ("-101", "NaN"),
-        ("\n", "\r\n"),
-        ("\n2022-11-23 13:24:05", "\n\n2022-11-23 13:24:05"),
-    ],
-)
-def test_powder_csv_in_other_spellings(tmp_path, old, new):
-    plain = raw_of_powder(write_walk(tmp_path)).arrays
-    other = raw_of_powder(write_walk(tmp_path, lambda text: text.replace(old, new))).arrays
-    assert all(equal(plain[name], other[name]) for name in set(plain) - {"row_name"})
-
-
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
     raw = raw_of_powder(
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
@@ -284,13 +268,6 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
         assert np.abs(found - degrees).max() < 1e-7 and np.allclose(world[:, 2], height)
 
 
-def test_ble_is_links_to_sensors(tmp_path):
-    data, arrays = load({"name": "ble", "file": str(write_npz(tmp_path, "ble"))}), ble_arrays()
-    assert data.site.static_end == "rx" and len(data) == 60 and data.site.carrier_hz == 2.44e9
-    assert data.site.stations.name == tuple(arrays["station"])
-    assert np.allclose(data.site.stations.position + data.site.origin, arrays["station_position"])
-
-
 MEASURED = [
     ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4),
     ("powder-rss-462mhz.npz", "powder", None),
@@ -314,19 +291,6 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
     with pytest.raises(DataError, match="this is a file of dataset=ble; say dataset=ble"):
         load({"name": "own", "file": str(file)})
-
-
-def test_measured_phases_fall_with_distance():
-    """One unknown phase per antenna and run: along the line of sight phases fall with distance."""
-    held = raw_of_techtile(real("real/techtile-csi-920mhz.npz")).arrays
-    distance = np.linalg.norm(held["tx_position"][:, None] - held["station_position"], axis=-1)
-    turn = 2 * np.pi * held["frequency_hz"] / 299_792_458 * distance
-    phase = np.where(held["mask"], np.exp(1j * np.angle(held["csi"])), 0)[held["run"] == "EXP005"]
-    falling, rising = (
-        np.abs((phase * np.exp(sign * 1j * turn[held["run"] == "EXP005"])).mean(axis=0)).mean()
-        for sign in (1, -1)
-    )
-    assert falling > 0.3 > 0.1 > rising
 
 
 def test_measured_stations_lie_where_the_release_says():

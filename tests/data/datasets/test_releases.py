@@ -242,13 +242,6 @@ def test_techtile_power_of_other_objects(tmp_path, refused):
     refused("expected one \\*_positions.npy", raw_of_techtile_power, tmp_path)
 
 
-def test_techtile_power_npz_reads_as_it_did():
-    held = raw_of_techtile_power(real("real/techtile-power-reci-rf-1.npz")).arrays
-    assert held["rx_position"].shape == (20382, 3) and held["rssi_db"].dtype == np.float32
-    file = str(real("real/techtile-power-reci-rf-1.npz"))
-    assert len(load({"name": "techtile_power", "file": file, "min_rssi_db": -75})) == 20309
-
-
 def test_rfid_list_of_our_tables_is_out_of_the_200(real_rfid, tmp_path):
     """Of the 200 only the 160 are here: where the others would lie, copies stand for them."""
     import csv

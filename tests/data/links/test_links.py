@@ -114,25 +114,12 @@ def test_the_mask_wins_over_the_sensitivity():
     assert read(town(rssi_db=holes, mask=mask, sensitivity_db=-80.0)).data.censored is None
 
 
-def test_two_coordinates_and_a_height():
-    data = read(town(tx_position=WALK[:, :2], tx_height=1.5)).data
-    np.testing.assert_allclose(data.tx[:, 2] + data.site.origin[2], 1.5)
-
-
 def test_a_station_at_two_carriers_is_two():
     carriers = np.repeat([4.6e8, 3.5e9], PLACES // 2)
     data = read(town(carrier_hz=carriers)).data
     assert len(data.site.stations) == 2 * STATIONS
     assert data.site.stations.name[:2] == ("north at 460 MHz", "north at 3500 MHz")
     assert data.site.stations.carrier_hz[data.station[-1]] == 3.5e9
-
-
-def test_channels_of_a_run_share_a_factor():
-    csi = RNG.normal(size=(PLACES, STATIONS, 2)) @ [1, 1j]
-    runs = np.array(["a", "b"])[np.arange(PLACES) % 2]
-    data = read(town(rssi_db=None, csi=csi, frequency_hz=9.2e8, run=runs)).data
-    assert data.target.shape == (PLACES * STATIONS, 1, 1)
-    np.testing.assert_array_equal(data.run, np.repeat(np.arange(PLACES) % 2, STATIONS))
 
 
 def test_the_files_own_split_names_rows_of_the_file():
@@ -170,6 +157,7 @@ SPOILT = {
     "NaN under a mask": (town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)), "not finite"),
     "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
     "latitude alone": (town(tx_position=None, latitude=np.full(PLACES, 40.0)), "given alone"),
+    "beyond the pole": (degrees(np.full(PLACES, 140.0), np.full(PLACES, 4.0)), "row 0: latitude 140"),
     "counts of degrees": (degrees(WALK[:, 0], WALK[1:, 1]), "9 values for 10"),
     "metres beside degrees": (
         degrees(WALK[:, 0], WALK[:, 1], station_position=POSTS), "in metres beside places in degrees",

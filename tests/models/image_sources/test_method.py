@@ -17,10 +17,9 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.closed_forms import ImageSources
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import box_of, gather, scatterers
-from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.mixture.named import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 from gsparc.training.race import Behind, Race
@@ -90,7 +89,7 @@ def test_paths_of_averaged_solutions_were_those_of_the_heaviest(small):
     other = copy.deepcopy(method)
     other.weights = 0.5 * other.weights
     model = ImageSources()
-    model.site, model.solution = data.site, Mixture.of([method, other], [0.6, 0.4])
+    model.site, model.members, model.weights = data.site, [method, other], (0.6, 0.4)
     predictor, world = Predictor(model, data.site), data.moving[fold.test[:5]] + data.site.origin
     channel, found = predictor.csi(rx=world), predictor.paths(rx=world)
     assert found.direction.shape[1] == found.gain.shape[2] >= 14

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import signal
+from functools import partial
+from pathlib import Path
+
+import lightning.pytorch as L
 import numpy as np
 import pytest
 import torch
 import yaml
+from campaigns import compose
 from clocks import wound
+from lightning.pytorch.loggers import CSVLogger
 from scenes import lobes, room
 
 from gsparc.data.query import Query
+from gsparc.data.splits import Fold
+from gsparc.evaluation.experiment.fit import callbacks_of
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import HasGaussians
-from gsparc.models.peers.trained import rate_factor
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
+from gsparc.training.fit import DEFAULTS
+from gsparc.training.optimizer import rate_factor
 
 SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 CHANNELS = ("gsrf", "ngrf", "newrf")
@@ -75,16 +85,23 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
     """Seconds stretched it, and a busy machine took other steps; only many times the seconds cut it."""
     data, fold = lobes(tmp_path)
     seen, clock = [], wound(monkeypatch).process_time
-    monkeypatch.setattr("gsparc.models.peers.trained.rate_factor", lambda p: seen.append(p) or rate_factor(p))
-    for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 1)):
+
+    def noted(kind, settings, step, total):
+        seen.append((step, total, rate_factor(kind, settings, step, total)))
+        return seen[-1][2]
+
+    monkeypatch.setattr("gsparc.training.optimizer.rate_factor", noted)
+    for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 0)):
         method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
         build = method.build
         method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
         seen.clear()
         report = method.fit(data, fold, FitContext(tmp_path))
         assert report.limited_by == ("processor" if slow_s > 1 else None)
-        assert method.steps == steps and sorted(set(seen)) == [step / steps for step in range(steps)]
-    assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
+        assert method.steps == steps and {step for step, *_ in seen} == set(range(steps + 1))
+        assert {total for _, total, _ in seen} == {5 if batch == 16 else 10}
+        if steps:
+            assert seen[0][2] > 0.9 and seen[-1][2] == pytest.approx(0.02), "rates fall to a fiftieth"
 
 
 def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, monkeypatch):
@@ -97,9 +114,66 @@ def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, mon
         method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
         report = method.fit(data, fold, FitContext(tmp_path))
         assert report.limited_by == ("processor" if slow_s > 1 else None)
-        assert method.steps == (1 if slow_s > 1 else 3)
+        assert method.steps == (0 if slow_s > 1 else 3)
         weights.append(torch.cat([w.flatten() for w in method.fitted().state_dict().values()]))
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+
+
+class Cut(L.Callback):
+    """Presses Ctrl-C in a step, and counts the steps that were taken."""
+
+    def __init__(self, step: int | None = None) -> None:
+        self.step, self.seen = step, 0
+
+    def on_train_batch_start(self, trainer, *unused):
+        self.seen += 1
+        if trainer.global_step == self.step:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_peers_had_loops_of_their_own(tmp_path):
+    """Options of the Trainer, callbacks and loggers did nothing, and an interrupted one could not go on."""
+    torch.set_num_threads(1)
+    data, fold = lobes(tmp_path)
+
+    def taught(folder, *more, **given):
+        method, trainer = brief("nerf2", max_steps=99), partial(DEFAULTS, max_steps=30, log_every_n_steps=10)
+        callbacks = [*callbacks_of(compose("model=nerf2").callbacks), *more]
+        context = FitContext(tmp_path / folder, trainer=trainer, callbacks=lambda: callbacks, **given)
+        return method, method.fit(data, fold, context)
+
+    counted, logger = Cut(), CSVLogger(tmp_path, "log")
+    whole, report = taught("whole", counted, loggers=[logger])
+    assert whole.steps == counted.seen == 30 and report.limited_by is None, "steps of the Trainer win"
+    logger.save()
+    text = (Path(logger.log_dir) / "metrics.csv").read_text()
+    assert "train/task_loss" in text and "rate/other" in text and "gaussians" not in text
+    last = tmp_path / "cut" / "last.ckpt"
+    with pytest.raises(KeyboardInterrupt, match=f"go on with ckpt_path={last}"):
+        taught("cut", Cut(7))
+    assert checkpoint.read(last).extra["trainer"]["global_step"] == 8
+    goes_on, _ = taught("again", resume=last)
+    for name, value in whole.fitted().state_dict().items():
+        assert torch.equal(value, goes_on.fitted().state_dict()[name]), name
+    other = Fold(fold.train[1:], fold.val, fold.test)
+    with pytest.raises(ValueError, match="was trained with other rows"):
+        brief("nerf2").fit(data, other, FitContext(tmp_path, resume=last))
+
+
+def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory(tmp_path, monkeypatch):
+    data, fold = lobes(tmp_path)
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    brief("swiftwrf").fit(data, fold, FitContext())
+    assert list(Path().iterdir()) == []
+
+
+def test_a_peer_trains_on_the_cpu_whatever_the_trainer_says(tmp_path, caplog):
+    """Under the Trainer it would have been moved to a device, and its own tensors not."""
+    data, fold = lobes(tmp_path)
+    trainer = partial(DEFAULTS, accelerator="gpu", devices=1, strategy="ddp")
+    brief("nerf2", max_steps=2).fit(data, fold, FitContext(tmp_path, trainer=trainer))
+    assert "in one process on the CPU" in caplog.text
 
 
 def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):

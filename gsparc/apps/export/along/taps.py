@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from gsparc.data.schema import LIGHT
 from gsparc.prediction.channels import Paths
@@ -58,7 +56,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Line:
-    """Taps at instants so close that those between are interpolated.
+    """Taps at instants so close that those between can be interpolated.
 
     The channel at f is the sum over l of `gain exp(-j 2 pi (f - carrier_hz) (first + l) / rate_hz)`.
 
@@ -80,19 +78,6 @@ class Line:
     residual: float
     worst: float
     paths: Paths | None = None
-
-    @cached_property
-    def _spline(self) -> CubicSpline:
-        return CubicSpline(self.time_s, self.gain)
-
-    def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Taps (m, A, L) complex64 at times (m,) [s] of the trajectory."""
-        return self._spline(time_s).astype(np.complex64)
-
-    def times(self, step_s: float) -> np.ndarray:
-        """Times (m,) `step_s` apart, from the first instant to the last."""
-        count = int(np.floor((self.time_s[-1] - self.time_s[0]) / step_s * (1 + 1e-12)))
-        return self.time_s[0] + step_s * np.arange(count + 1)
 
     def doppler_hz(self) -> np.ndarray:
         """Mean Doppler shift (A, L) float64 [Hz] of each tap: the phase it gains from instant to instant."""

@@ -16,12 +16,13 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.closed_forms import ClosedForms
+from gsparc.models.closed_form import ClosedForm
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
+from gsparc.models.mixture.named import NamedMixture
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
@@ -104,8 +105,8 @@ def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Gsparc):
         return exact_form(method.chosen, site)
-    if isinstance(method, ClosedForms):
-        return None if method.solution.only is None else exact_form(method.solution.only, site)
+    if isinstance(method, NamedMixture):
+        return None if method.only is None else exact_form(method.only, site)
     if isinstance(method, Residual):
         return exact_form(method.method, site) if method.rest is None or not method.share else None
     if isinstance(method, PowerField):
@@ -165,9 +166,8 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
 
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
-    solution = getattr(method, "solution", None)
-    parts = [] if solution is None else sorted(solution.parts(), key=lambda one: -one[0])
-    for one in [method, *(part for _, part in parts)]:
+    parts = method.parts() if isinstance(method, ClosedForm) else ()
+    for _, one in sorted(parts, key=lambda part: -part[0]):
         if isinstance(one, ImageSourceGP):
             return one
     raise ValueError(

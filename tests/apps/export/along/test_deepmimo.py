@@ -100,3 +100,15 @@ def test_models_without_paths_are_refused(tmp_path):
     with pytest.raises(ValueError, match="made of paths"):
         deepmimo.write(tmp_path, Waves(), PLACES)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_package_of_that_name_reads_it(tmp_path, monkeypatch):
+    package = pytest.importorskip("deepmimo", reason="deepmimo 4 is not installed")
+    folder = tmp_path / "deepmimo_scenarios" / "mirror"
+    folder.mkdir(parents=True)
+    deepmimo.write(folder, Mirror(), PLACES)
+    monkeypatch.chdir(tmp_path)
+    how = package.ChannelParameters()
+    how.bs_antenna.shape = np.array([1, 1])
+    found = package.load("mirror").compute_channels(how)[:, 0, 0, 0] * how.ofdm.subcarriers**0.5
+    np.testing.assert_allclose(found, Mirror().paths(PLACES).gain[:, 0].sum(-1), rtol=1e-4)

@@ -20,7 +20,6 @@ from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
@@ -44,7 +43,7 @@ log = logging.getLogger(__name__)
 PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
-class ClosedForms(LearnsTogether):
+class NamedMixture(LearnsTogether, Mixture):
     """Solutions whose weights follow from the rows in closed form, weighed by held-out groups.
 
     Args:
@@ -54,22 +53,20 @@ class ClosedForms(LearnsTogether):
         residual_alone: whether no sources are asked for.
     """
 
-    has_gaussians = True
     resumable = True
     stored_names: ClassVar[dict[str, str]] = {"position_std": ""}
-    solution: Mixture  # after `fit` or `restore`
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
         init: InitSettings | None = None, residual_alone: bool = False,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
-        self.switches, self.position_std, self.init = effects, position_std, init or InitSettings()
-        self.residual_alone = residual_alone
+        super().__init__((), init or InitSettings(), effects)
+        self.position_std, self.residual_alone = position_std, residual_alone
         self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
 
     @abstractmethod
-    def parts(self, data: Measurements) -> tuple[str, ...]:
+    def tries(self, data: Measurements) -> tuple[str, ...]:
         """Names of candidates (`gsparc.models.mixture.candidates`), weighed where they are several."""
 
     @abstractmethod
@@ -84,13 +81,12 @@ class ClosedForms(LearnsTogether):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        inner = self.solution.only if hasattr(self, "solution") else None
-        return self.name if inner is None else inner.label.replace(inner.name, self.name, 1)
+        return self.name if self.only is None else self.only.label.replace(self.only.name, self.name, 1)
 
     @property
     def effects(self) -> str:  # type: ignore[override]
         """The terms that are computed, for `summary.json`."""
-        return "+".join(self.solution.terms) or "residual"
+        return "+".join(self.terms) or "residual"
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -104,7 +100,7 @@ class ClosedForms(LearnsTogether):
         with heeded.apart():
             if (why := self.obstacle(data)) is not None:
                 raise ValueError(f"{self.name}: {why}")
-            parts = self.parts(data)
+            parts = self.tries(data)
             named = self.init.name in ("auto", "diffuse", *parts)
             name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
             init = replace(self.init, name=name)
@@ -125,7 +121,7 @@ class ClosedForms(LearnsTogether):
         budget = context.time_budget()
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refined(self.solution, self.runs.aligned(data), std)
+        rows, by, note = refined(self, self.runs.aligned(data), std)
         if by.any() and budget.over():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -144,9 +140,10 @@ class ClosedForms(LearnsTogether):
     ) -> FitReport:
         """Fit and weigh candidates `parts`, of channels of several runs in the phase and level of one."""
         budget, known = context.time_budget(), np.sort(np.concatenate([fold.train, fold.val]))
-        self.runs, self.solution = _runs(data, known, context), Mixture(parts, init, self.switches)
+        self.runs = _runs(data, known, context)
         aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
-        report = self.solution.fit(self.runs.aligned(data), fold, replace(context, budget_s=budget.left_s))
+        within = replace(context, budget_s=budget.left_s)
+        report = self.weighed(parts, init, self.runs.aligned(data), fold, within)
         if not aligning:
             return report
         cost = Cost({"factors of runs": aligning}) + report.cost
@@ -154,41 +151,31 @@ class ClosedForms(LearnsTogether):
 
     # -- answering ---------------------------------------------------------------------------------
 
-    def objects(self) -> SiteObjects:
-        """Those of the field with closed-form weights."""
-        return self.solution.objects()
-
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        if not hasattr(self, "solution"):
+        if not self.members:
             raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
-        told = Prediction.joined([self.solution.predict(part) for part in query.split(QUERY_CHUNK)])
+        told = Prediction.joined([super(NamedMixture, self).predict(q) for q in query.split(QUERY_CHUNK)])
         return self.runs.restored(told, query.run)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        inner = self.solution.only
-        return inner.process() if isinstance(inner, HasProcess) else None
+        return self.only.process() if isinstance(self.only, HasProcess) else None
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
-        if not self.solution.forgets:
+        if not self.forgets:
             return None
-        result = copy.copy(self)
-        result.solution = copy.deepcopy(self.solution)
-        result.solution.condition(data, rows)
+        result = copy.deepcopy(self)
+        result.condition(data, rows)
         return result
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`; fields in closed form have gradients."""
-        return None
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
 
         What other solutions and the residual add to channels is in no path.
         """
-        made = [(weight, one) for weight, one in self.solution.parts() if isinstance(one, HasPaths)]
+        made = [(weight, one) for weight, one in self.parts() if isinstance(one, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
         result = [(weight, method.paths(query)) for weight, method in made]
@@ -200,44 +187,38 @@ class ClosedForms(LearnsTogether):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        return () if self.solution.only is None else knobs(self.solution.only)
+        return () if self.only is None else knobs(self.only)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
-        inner = self.solution.only
-        return {} if inner is None else contributions(inner, data, rows)
+        return {} if self.only is None else contributions(self.only, data, rows)
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        inner = self.solution.only
-        return self if inner is None or not knobs(inner) else reduced(inner, settings, measured)
+        return self if self.only is None or not knobs(self.only) else reduced(self.only, settings, measured)
 
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"solution": self.solution.state(), "runs": self.runs.state()}
+        return {**super().state(), "runs": self.runs.state()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.runs, self.solution = site, RunFactors.read(state["runs"]), Mixture()
-        self.solution.restore(site, state["solution"])
-
-    def size(self) -> int:
-        """Number of Gaussians."""
-        return self.solution.count
+        super().restore(site, state)
+        self.runs = RunFactors.read(state["runs"])
 
     @property
     def made(self) -> str:
         """See `Method`."""
-        terms = ", ".join(self.solution.terms) or "a process alone"
-        return f"{self.solution.started.replace('+', ' + ')} in closed form: {terms}"
+        terms = ", ".join(self.terms) or "a process alone"
+        return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
 
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""
         return super().facts() | {
-            "model/init": self.solution.started, "model/variance_explained": self.solution.explained,
-            "model/steps": 0, "model/steps_taken": 0, "time/init_s": self.solution.init_s,
+            "model/init": self.started, "model/variance_explained": self.explained,
+            "model/steps": 0, "model/steps_taken": 0, "time/init_s": self.init_s,
         }  # fmt: skip
 
 
@@ -251,61 +232,61 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
     return waves.runs
 
 
-class ImageSources(ClosedForms):
+class ImageSources(NamedMixture):
     """Image sources, found by searches or along measured directions, beside a process of waves."""
 
     name = "image_sources"
 
-    def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`."""
+    def tries(self, data: Measurements) -> tuple[str, ...]:
+        """See `NamedMixture`."""
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = searched if self.init.name == "auto" else (str(self.init.name),)
         # Offsets are known to sources alone.
         return (*placed, "diffuse") if self.plain and self.init.snapshot == "none" else placed
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return no_phase(data)
 
 
-class Channels(ClosedForms):
+class Channels(NamedMixture):
     """Leakage, a direct wave and waves from all around; where rows were turned to each other, a process."""
 
     name = "channels"
 
-    def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`; no phase tells of paths where rows have phases of their own."""
+    def tries(self, data: Measurements) -> tuple[str, ...]:
+        """See `NamedMixture`; no phase tells of paths where rows have phases of their own."""
         return ("aligned",) if data.site.phase_reference == "neighbours" else ("diffuse",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return None if data.site.kind == "csi" else f"the target is {data.site.kind}, not channels"
 
 
-class Powers(ClosedForms):
+class Powers(NamedMixture):
     """A process of decibels about a distance law; of several stations, about a law of the site."""
 
     name = "powers"
 
-    def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`; `init=scene` knows walls."""
+    def tries(self, data: Measurements) -> tuple[str, ...]:
+        """See `NamedMixture`; `init=scene` knows walls."""
         several = data.site.stations is not None and len(data.site.stations) > 1
         return ("scene",) if self.init.name == "scene" else ("joint_powers",) if several else ("powers",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 
 
-class Bearings(ClosedForms):
+class Bearings(NamedMixture):
     """Sources where bearings of a moving array cross, with processes of powers, beside the plain process."""
 
     name = "bearings"
 
-    def parts(self, data: Measurements) -> tuple[str, ...]:
-        """See `ClosedForms`."""
+    def tries(self, data: Measurements) -> tuple[str, ...]:
+        """See `NamedMixture`."""
         return ("bearings", "process") if self.plain and len(data) <= PROCESS_ROWS else ("bearings",)
 
     def obstacle(self, data: Measurements) -> str | None:
-        """See `ClosedForms`."""
+        """See `NamedMixture`."""
         return no_array(data.site, "tx", "the receiver stands still")

@@ -1,40 +1,171 @@
-"""Risk against coverage, and whether promises hold: thresholds of many draws, tried on other rows."""
+"""A threshold with a promise: at most a share alpha of accepted positions is bad, with confidence 1 - delta.
+
+Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing: thresholds are
+tried from strict to lax, each is a binomial test on the calibration positions it accepts, and the first that
+fails ends the search. Given who is accepted the bad ones are binomial, so the promise is about the error
+*among accepted positions*; plain split conformal promises a share of all positions instead. Whether promises
+hold is told by `trials`: thresholds of many draws, tried on other rows.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.special import betainc
+from scipy.stats import beta, chi2, spearmanr
 
-from gsparc.data.datasets.argos import published_figures, published_normalisation
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
-from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, open_files
-from gsparc.evaluation.scores import rows_of
-from gsparc.models.method import Method, predictions
-from gsparc.prediction.confidence import (
-    Evidence,
-    Trusted,
-    gather,
-    joined,
-    keep,
-    known_positions,
-    position_kernel,
-    threshold_of,
-)
-from gsparc.prediction.risk_threshold import (
-    Guarantee,
-    Threshold,
-    binomial_interval,
-    choose,
-    levels_of,
-    spread_out,
-)
+from gsparc.data.splits import far_apart
+
+RIVALS = ("distance", "gp_variance")
+KINDS = ("learned", "expected", *RIVALS)
+LEVELS = 50
+SURE_OF_EFFECT = 0.8
+How = Literal["random", "spatial"]
+SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
+CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Positions a method did not learn from.
+
+    Attributes:
+        row: (n,) rows of the dataset.
+        position: (n, 3) [m].
+        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
+        scores: by kind, (n,) each, larger is surer.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    error: np.ndarray
+    scores: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Folds together; scores that not every part has are dropped."""
+    kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
+    scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
+    facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
+    row, position, error = map(np.concatenate, facts)
+    return Evidence(row, position, error, scores)
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What is promised.
+
+    Attributes:
+        limit_db: a prediction is bad when |e|^2 / |h|^2 exceeds this [dB].
+        alpha: largest share of bad ones among the accepted.
+        delta: probability that a calibration set misleads.
+    """
+
+    limit_db: float = -10.0
+    alpha: float = 0.1
+    delta: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (0 < self.alpha < 1 and 0 < self.delta < 1):
+            raise ValueError(f"promise: alpha={self.alpha} and delta={self.delta} must lie between 0 and 1")
+
+    @property
+    def least(self) -> int:
+        """Positions that must be accepted, all of them good, before anything can be promised."""
+        return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
+
+    def bad(self, relative_error: np.ndarray) -> np.ndarray:
+        """Whether predictions (n,) are bad."""
+        return relative_error > 10 ** (self.limit_db / 10)
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A threshold and what it was chosen on.
+
+    Attributes:
+        value: accept scores of at least this; infinite when nothing can be promised.
+        accepted: calibration positions it accepts.
+        bad: how many of them are bad.
+    """
+
+    value: float
+    accepted: int
+    bad: int
+
+    def bound(self, delta: float) -> float:
+        """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
+        return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
+
+
+def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:
+    """Clopper and Pearson's interval (1934) of a rate."""
+    if count == 0:
+        return 0.0, 1.0
+    tail = (1 - level) / 2
+    low = 0.0 if errors == 0 else float(beta.ppf(tail, errors, count - errors + 1))
+    high = 1.0 if errors == count else float(beta.ppf(1 - tail, errors + 1, count - errors))
+    return low, high
+
+
+def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
+    """Thresholds (at most `count`,) to try, strict to lax: quantiles of scores (n,) not the calibration's."""
+    return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
+
+
+def choose(
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    promise: Guarantee,
+    group: np.ndarray | None = None,
+) -> Threshold:
+    """The laxest threshold that the calibration set (n,) supports.
+
+    Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
+    by the design effect, how much more the share varies between patches than binomial counts would (Kish
+    1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
+    could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
+    """
+    threshold = Threshold(float("inf"), 0, 0)
+    for level in levels:
+        rows = score >= level
+        accepted, wrong = int(rows.sum()), int(bad[rows].sum())
+        if accepted < promise.least:
+            continue
+        effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
+        if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
+            break
+        threshold = Threshold(float(level), accepted, wrong)
+    return threshold
+
+
+def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
+    """Variance of the share of bad ones (n,) between groups (n,) over that of independent draws; at least 1.
+
+    A variance between few groups is itself uncertain: what is returned is its one-sided bound at
+    `SURE_OF_EFFECT`, as of a normal variance.
+    """
+    _, which = np.unique(group, return_inverse=True)
+    counts, wrong = np.bincount(which), np.bincount(which, bad)
+    share, groups = wrong.sum() / counts.sum(), len(counts)
+    if groups < 2 or share in (0.0, 1.0):
+        return 1.0
+    between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
+    bound = (groups - 1) / chi2.ppf(1 - SURE_OF_EFFECT, groups - 1)
+    return max(1.0, float(bound * between / (share * (1 - share))))
+
+
+def _tail(wrong: float, accepted: float, alpha: float) -> float:
+    """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
+    return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
 
 
 def bounded(relative_error: np.ndarray) -> np.ndarray:
@@ -63,12 +194,6 @@ def rank_correlation(score: np.ndarray, loss: np.ndarray) -> float | None:
     if np.ptp(score) == 0 or np.ptp(loss) == 0:
         return None
     return float(spearmanr(score, -loss).statistic)
-
-
-How = Literal["random", "spatial"]
-SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
-MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
-CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
 
 @dataclass(frozen=True)
@@ -187,7 +312,8 @@ def accept(
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], promise.bad(evidence.error)
-    calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
+    if apart_m > 0:  # neighbours err together and count as one
+        calibrate = far_apart(evidence.position, calibrate, apart_m, rng)
     patch = cells(evidence.position)[calibrate] if spatial else None
     threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
     return used, threshold, test, choose_on
@@ -218,112 +344,6 @@ def trials(
         coverage.append(len(accepted) / max(len(test), 1))
     most = max(set(kinds), key=kinds.count)
     return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
-
-
-NAMES = {
-    "learned": "learned", "expected": "expected error", "distance": "distance to the nearest",
-    "gp_variance": "GP variance",
-}  # fmt: skip
-
-
-def draw_calibration(
-    evidence: Evidence, trials: Sequence[Trial], promise: Guarantee, title: str, path: Path
-) -> None:
-    """Save risk against coverage, and what came of the draws, as one PNG."""
-    figure, ((left, right),) = panels(11, 4.2, 1, 2)
-    loss = bounded(evidence.error)
-    coverage = np.arange(1, len(loss) + 1) / len(loss)
-    for kind, score in evidence.scores.items():
-        risk = risk_coverage(score, loss)
-        left.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
-    risk = risk_coverage(-loss, loss)
-    left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
-    left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
-    left.set_title(title)
-    for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
-        broken = trial.facts()["broken_of_all"]
-        label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
-        right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
-    # a draw that accepts nobody has no share of bad ones: NaN
-    worst = max(promise.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
-    right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
-    if not any(trial.coverage.any() for trial in trials):
-        right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
-    right.axhline(promise.alpha, color="black", linewidth=1)
-    right.set_title(f"promise: at most {promise.alpha:.0%} bad, broken in at most {promise.delta:.0%}")
-    right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
-    for axis in (left, right):
-        axis.legend(fontsize=8)
-    save(figure, path)
-
-
-def collect(
-    paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
-) -> tuple[Evidence, dict[str, Any]]:
-    """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
-    parts, seen = [], np.zeros(0, np.int64)
-    facts: dict[str, Any] = {}
-    for path in paths:
-        run = _unseen(path, dataset, split)
-        fold = run.split.folds[0]
-        rows = np.setdiff1d(rows_of(fold, "test"), seen)
-        if len(rows):
-            parts.append(gather(run.methods[0], run.data, fold, rows))
-        seen = np.concatenate([seen, rows])
-        facts = facts or _published(run.methods[0], run.data, fold) | run.facts()
-    return joined(parts), facts
-
-
-def store(
-    path: str,
-    dataset: dict[str, Any],
-    split: dict[str, Any],
-    promise: Guarantee,
-    kind: str,
-    spatial: bool,
-    seed: int,
-) -> tuple[Trusted, str]:
-    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
-    run = _unseen(path, dataset, split)
-    method, data, fold = run.methods[0], run.data, run.split.folds[0]
-    evidence = gather(method, data, fold, rows_of(fold, "test"))
-    kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
-    threshold = threshold_of(kind_used, choice)
-    stored = Trusted(kind_used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
-    keep(path, stored)
-    if np.isfinite(threshold):
-        return stored, f"accepted from {threshold:.4g}"
-    if too_few(len(evidence), promise) is not None:
-        return stored, "no threshold keeps the bound"
-    bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
-    other = laxer(evidence, promise, kind, spatial, seed)
-    hint = (
-        f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
-    )
-    return stored, (
-        f"no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse than {limit}, "
-        f"and the others are not told from them surely enough; {hint} kept, more training rows may help"
-    )
-
-
-def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
-    """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
-    run = open_files([path], dataset, split)
-    if run.learned != 0:
-        advice = "calibrate with the data and split of its training"
-        raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
-    return run
-
-
-def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
-    """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
-    if data.uplink is None:
-        return {}
-    predicted = np.concatenate([said.mean.numpy() for _, _, said in predictions(method, data, fold.test)])
-    target = data.target[fold.test]
-    both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
-    results = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
-    return {f"{room}/{name}": value for room, one in results.items() for name, value in one.items()}
 
 
 def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
