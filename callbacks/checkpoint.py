@@ -8,8 +8,8 @@ from typing import Any
 import lightning.pytorch as L
 
 from gsparc.data.limits import Checked, setting
-from gsparc.training.fit import stands
-from gsparc.training.schedule import INTERVAL, in_steps
+from gsparc.field.fit import stands
+from gsparc.field.schedule import INTERVAL, in_steps
 
 
 @dataclass(eq=False)

@@ -14,9 +14,9 @@ from torch import Tensor
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
+from gsparc.field.processes import largest, total
 from gsparc.field.readout import solved_again
-from gsparc.training.processes import largest, total
-from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.field.schedule import INTERVAL, STEPS, due, in_steps
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import torch
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
-from gsparc.training.schedule import INTERVAL, in_steps
+from gsparc.field.schedule import INTERVAL, in_steps
 from gsparc.training.tracking import picture
 
 

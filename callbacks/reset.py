@@ -11,7 +11,7 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.data.limits import SHARE, Checked, setting, whole
-from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.field.schedule import INTERVAL, STEPS, due, in_steps
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)

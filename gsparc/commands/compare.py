@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from rich.markdown import Markdown
 from gsparc.commands.shared.output import finish, run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.train import begin, train
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import choice
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged
-from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
+from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.places import compare_places, facts_and_table
@@ -39,18 +41,19 @@ def task(config: DictConfig) -> pd.DataFrame:
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]
     only_prints = locating and settings["locate"]["fingerprints"] and not any(paths)
-    problems = [] if only_prints else problems_of(settings, cells_dir)
+    problems = [] if only_prints else problems_of(settings)
     budgets = [
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
+    own = {name: of or {} for name, of in settings["datasets"].items()}
     prepared = [
-        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, cells_dir)
+        prepare(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     with locked(cells_dir, "cells"):
-        filled = fill_all(prepared, bool(settings["train"]), limit_s)
+        filled = fill_all(prepared, run, bool(settings["train"]), limit_s)
         if locating:
             from gsparc.commands.locate import locate  # here: the core compares without the apps
 
@@ -65,6 +68,15 @@ def task(config: DictConfig) -> pd.DataFrame:
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 
+def run(one: Prepared, left: str | None) -> None:
+    """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
+    config = deepcopy(one.config)
+    config.ckpt_path = config.ckpt_path or left
+    _, made = train(config, one.folder, begin(config, one.problem.data), in_full=False)
+    for file in made.checkpoints if one.problem.draw else ():  # queries are timed with those of the first
+        file.unlink()
+
+
 def report(
     filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
 ) -> pd.DataFrame:
@@ -74,11 +86,9 @@ def report(
     """
     rows = rows_of(filled, timed)
     blocks = blocks_of(rows)
-    unscored = {one.cell.method for one in filled if not one.scored()}
-    only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
-    page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours, only_timed)])
+    page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours)])
     write_samples(run_dir / "compare.csv", rows.to_dict("list"))
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")

@@ -11,8 +11,7 @@ from omegaconf import DictConfig
 
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
-from gsparc.apps.export.along.impulses import write_impulses
-from gsparc.apps.export.along.taps import Trajectory
+from gsparc.apps.export.along.taps import Trajectory, write_impulses
 from gsparc.apps.export.compiled.blob import write
 from gsparc.apps.export.compiled.make import FIGURES, compiled
 from gsparc.commands.shared.output import finish, run_directory

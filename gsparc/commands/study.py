@@ -18,6 +18,7 @@ from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.experiment.done import State, content
 from gsparc.evaluation.experiment.fit import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Study, facts_of
@@ -59,9 +60,11 @@ def task(config: DictConfig) -> pd.DataFrame:
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
     try:
-        rows = study.run(data, split, context_of(config, run_dir=run_dir))
-    except KeyboardInterrupt:  # whose advice is that of a training, which can be gone on with
-        raise KeyboardInterrupt("the study was interrupted; it keeps nothing to go on from") from None
+        state = State.of(config, content(data), split.sha256)
+        rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
+    except KeyboardInterrupt:  # whose advice is that of a training
+        message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
+        raise KeyboardInterrupt(message) from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
         "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base, **facts_of(rows),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import statistics
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -17,7 +18,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared import cli
-from gsparc.commands.shared.continued import once
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
@@ -34,6 +34,7 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
+from gsparc.evaluation.experiment.done import State, content, once, program
 from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
@@ -77,7 +78,45 @@ class Objects:
     evaluation: Evaluation
 
 
-def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
+@dataclass(frozen=True)
+class Begun:
+    """What a run begins with, before anything is fitted.
+
+    Attributes:
+        method: unfitted.
+        module, split: the data, read, and their folds.
+        reads: which of the given options were heeded so far.
+        watch: of the seconds since reading began.
+    """
+
+    method: Method
+    module: DataModule
+    split: Split
+    reads: heeded.Reads
+    watch: TimeBudget
+
+
+def begin(config: DictConfig, known: Measurements | None = None) -> Begun:
+    """Check the settings and read the data; nothing is written.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        known: the measurements, where they were read before.
+
+    Raises:
+        ValueError: bad data or settings, one line each.
+    """
+    method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
+    RunSettings.of(config)
+    watch, reads = TimeBudget(clock=config.budget_clock), options.noting(config, method)
+    with heeded.recording(reads):
+        module = _data(config, known)
+        return Begun(method, module, split_for(plain(config.split), module.measurements), reads, watch)
+
+
+def train(
+    config: DictConfig, run_dir: Path, begun: Begun | None = None, *, in_full: bool = True
+) -> tuple[dict[str, Any], Objects]:
     """Fit a method on every fold of a split, test it beside baselines, and write it all down.
 
     The folder is locked meanwhile. What an earlier run left there is set aside first, but for what this one
@@ -86,6 +125,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     Args:
         config: as composed from conf/train.yaml.
         run_dir: where checkpoints, curves, pictures and `summary.json` go.
+        begun: what it begins with, where that was read before.
+        in_full: whether it says what it learns from, times queries and draws pictures, too.
 
     Returns:
         The facts of `summary.json`, and the objects they were computed from.
@@ -94,23 +135,19 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint, one line each; or another run writes there.
     """
     with locked(run_dir):
-        method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
-        RunSettings.of(config)
         _set_earlier_aside(config, run_dir)
-        run_id, watch = summary.new_run_id(), TimeBudget(clock=config.budget_clock)
-        reads = options.noting(config, method)
-
-        with heeded.recording(reads):
-            module = _data(config)
-            data = module.measurements
-            split = split_for(plain(config.split), data)
+        begun = begun or begin(config)
+        method, reads, split, data = begun.method, begun.reads, begun.split, begun.module.measurements
+        run_id = summary.new_run_id()
         resumes = _resumes(config, len(split.folds))
         _check(config, method, data, split, resumes)
+        if in_full:
+            _say(config, method, data, split)
         write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
 
         with tracking.opened(config) as loggers:
-            whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=module)
-            contexts = _of_folds(whole, split, resumes, watch.spent)
+            whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
+            contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
                 # `Method.fit` of every fold. For gradient steps training/fit.py `run_stage` makes the Trainer
                 # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
@@ -121,17 +158,19 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             unused = options.unheeded(reads, fits.methods[0], data)
             evaluation = evaluate(
                 fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
-                shared=_as_baseline(config, method),
+                shared=_as_baseline(config, method), timed=in_full,
             )  # fmt: skip
 
             facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}
             facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
+            facts["program"] = program(plain(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
             objects = Objects(fits.methods, files, data, split, evaluation)
-            _draw(loggers, config, facts, objects, run_dir)
+            if in_full:
+                _draw(loggers, config, facts, objects, run_dir)
         samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
         summary.write_samples(run_dir / "per_sample.csv", samples)
-        summary.write_summary(run_dir / "summary.json", facts)
+        summary.write_summary(run_dir / summary.SUMMARY, facts)
         return facts, objects
 
 
@@ -142,12 +181,14 @@ def _set_earlier_aside(config: DictConfig, run_dir: Path) -> None:
         log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
 
 
-def _data(config: DictConfig) -> DataModule:
-    """The data, in the coordinates and units of the model that training starts from, if there is one."""
+def _data(config: DictConfig, known: Measurements | None) -> DataModule:
+    """The data, read or known, in coordinates and units of the model that training starts from, if any."""
     path, start = config.ckpt_path, config.get("init_from")
     if path is not None and not Path(path).exists():  # before anything is read or simulated
         raise ValueError(f"ckpt_path={path}: no such file")
     module = datamodule(config.dataset)
+    if known is not None:
+        module.measurements = known
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
@@ -178,7 +219,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
 def _check(
     config: DictConfig, method: Method, data: Measurements, split: Split, resumes: Sequence[Path | None]
 ) -> None:
-    """Refuse now what would be found after the training; say what is learned from, and what is guessed.
+    """Refuse now what would be found after the training.
 
     Raises:
         ValueError: an objective, a file of walls, a split, weights to start from or a resume that cannot be.
@@ -186,12 +227,16 @@ def _check(
     objective_of(config, data.site.scored)
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
-    for topic, sentence in in_short(data, split):
-        log.info("%-10s%s", topic, sentence)
     if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
         raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
     if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+
+
+def _say(config: DictConfig, method: Method, data: Measurements, split: Split) -> None:
+    """Say what is learned from, and what is guessed."""
+    for topic, sentence in in_short(data, split):
+        log.info("%-10s%s", topic, sentence)
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
@@ -255,7 +300,8 @@ def _as_baseline(config: DictConfig, method: Method) -> str | None:
 
 
 def _of_fits(fits: Outcome) -> dict[str, Any]:
-    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by}
+    cpu_s = statistics.fmean(fits.train_cpu_s)
+    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
     if fits.cost.stages:
         facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
     return facts
@@ -299,33 +345,39 @@ def objective_of(config: DictConfig, kind: Scored) -> str:
 
 
 def task(config: DictConfig) -> float:
-    """Train as configured and show the table; what was interrupted goes on, see `once`.
+    """Train as configured and show the table; a job of a multirun is done once, see `once`.
 
     Returns:
         The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned; NaN
             where the data do not tell it and no search asks.
     """
-    job = HydraConfig.get().mode == RunMode.MULTIRUN
+    hydra = HydraConfig.get()
+    run_dir, job = run_directory(), hydra.mode == RunMode.MULTIRUN
     if config.ckpt_path is not None:
-        words = HydraConfig.get().overrides.task
-        log.info("with the settings of the run that it goes on from: %s", " ".join(words))
-    return once(run_directory(), config, _train_and_show, again=not job)
-
-
-def _train_and_show(config: DictConfig) -> float:
-    run_dir = run_directory()
-    facts, objects = train(config, run_dir)
-    figure = objective_of(config, objects.data.site.scored)
-    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, results, lines=summary.remarks(facts, config.eval_on))
+        words = " ".join(hydra.overrides.task)
+        log.info("with the settings of the run that it goes on from: %s", words)
+    with locked(run_dir / ".job"):  # the run's own is its training's
+        begun = begin(config)
+        state = State.of(config, content(begun.module.measurements), begun.split.sha256)
+        facts = once(
+            run_dir, state, partial(_train_and_show, config, begun), reuse=config.reuse, again=not job
+        )
+    figure = objective_of(config, facts["dataset/kind"])
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:
         return score_of(figure, value)
-    hydra = HydraConfig.get()
-    if hydra.mode == RunMode.MULTIRUN and hydra.runtime.choices["hydra/sweeper"] != "basic":
+    if job and hydra.runtime.choices["hydra/sweeper"] != "basic":
         raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")
     return math.nan  # only a search asks for it
+
+
+def _train_and_show(config: DictConfig, begun: Begun, left: str | None) -> None:
+    """Train, from what an interrupted try has left where nothing else is said."""
+    run_dir, config.ckpt_path = run_directory(), config.ckpt_path or left
+    facts, objects = train(config, run_dir, begun)
+    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
+    results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
+    show(run_dir, results, lines=summary.remarks(facts, config.eval_on))
 
 
 def main() -> None:

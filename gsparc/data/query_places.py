@@ -14,7 +14,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import ENDS, End
 from gsparc.data.tables import is_table
-from gsparc.data.tables.columns import Chosen, choose, station_names
+from gsparc.data.tables.columns import Chosen, choose
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.opening import sheet_of
 from gsparc.data.tables.places import Places, places
@@ -142,7 +142,7 @@ def _missing(sheet: Sheet, end: End, both: bool) -> str:
 def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
     if role not in chosen:
         return None
-    head, words = chosen[role][0].head or "", station_names(sheet, chosen[role])
+    head, words = chosen[role][0].head or "", sheet.joined(c.head for c in chosen[role])
     sheet.refuse_rows(head, np.flatnonzero(words == ""), f"no {role}; expected its name")
     return words
 

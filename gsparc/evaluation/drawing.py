@@ -72,7 +72,6 @@ METHODS = {
     "wrfgs": Look("#4B5320", "D"),
     "array": Look("#4B5320", "X", True),
     "nerf2": Look("#000000", "o"),
-    "nerf2_published": Look("#000000", "^", True),
     "image_source_gp": Look("#000000", "v"),
     "nearest": Look("#332288", "^"),
     "gsrf": Look("#882255", "P"),

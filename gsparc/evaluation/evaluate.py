@@ -54,6 +54,7 @@ def evaluate(
     clock: ClockSettings | None = None,
     learned: tuple[Measurements, Split] | None = None,
     shared: str | None = None,
+    timed: bool = True,
 ) -> Evaluation:
     """Score and time a method beside the baselines.
 
@@ -67,6 +68,7 @@ def evaluate(
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
         shared: the baseline that the methods are, which is then not fitted again.
+        timed: whether latencies are measured.
 
     Returns:
         `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
@@ -107,7 +109,7 @@ def evaluate(
     if FIELD in every:
         contenders[FIELD], facts[f"{FIELD}/train_s"] = fields[0], facts["time/train_s"]
     facts |= timing.machine_facts()
-    facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
+    facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock) if timed else {}
     first = methods[0]
     facts |= {"model/name": first.name, "model/label": common_label(first.name, methods)}
     facts |= {"model/effects": first.effects, **first.facts()}

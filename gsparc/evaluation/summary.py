@@ -23,6 +23,7 @@ from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
+SUMMARY = "summary.json"
 WITH_SILENT = "rmse_db_with_silent"
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
@@ -36,6 +37,15 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
     with whole_file(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
+
+
+def read_summary(path: str | Path) -> dict[str, Any] | None:
+    """Return the facts of a summary; None where there is none, or no whole one."""
+    try:
+        facts = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return facts if isinstance(facts, dict) else None
 
 
 def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:

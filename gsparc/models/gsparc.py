@@ -14,6 +14,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
+from gsparc.field.module import GaussianModule
 from gsparc.models.method import HasPaths, HasProcess, Method, Reconditions
 from gsparc.models.mixture.named import Bearings, Channels, ImageSources, NamedMixture, Powers
 from gsparc.models.refined_places import errors_of
@@ -23,7 +24,6 @@ from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, called_for
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.module import GaussianModule
 
 log = logging.getLogger(__name__)
 

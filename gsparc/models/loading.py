@@ -9,11 +9,11 @@ from typing import Protocol, runtime_checkable
 
 from hydra.utils import get_class
 
+from gsparc.field.module import GaussianModule
 from gsparc.models import checkpoint
 from gsparc.models.method import Method, TrainsByGradient
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import build, known
-from gsparc.training.module import GaussianModule
 
 
 @runtime_checkable

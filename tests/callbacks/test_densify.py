@@ -9,8 +9,8 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings, Rendered
+from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Pose
-from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 

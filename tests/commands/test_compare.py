@@ -12,12 +12,8 @@ import pytest
 from campaigns import spectra
 from doors import knock
 
-from gsparc.commands import compare as command
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared.run_lock import locked
-from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.fitting import Filled
-from gsparc.evaluation.experiment.latency import Latency
 
 ROOT = Path(__file__).parents[2]
 FILLED = re.compile(r"own/\S+: \S+ dB after ")  # a line of each cell
@@ -35,16 +31,6 @@ def compare(tmp_path, *more: str) -> tuple[int, str]:
     """Exit status, and what is said."""
     answer = knock(COMMANDS["compare"].run, "compare", words(tmp_path, *more))
     return answer.status, "\n".join([*answer.out, *answer.err])
-
-
-def test_what_is_only_timed_is_a_page_too(tmp_path, monkeypatch):
-    shown = []
-    monkeypatch.setattr(command, "show", lambda *given: shown.append(given))
-    facts = {"dataset/kind": "spectrum"}
-    cell = Filled(Cell("toy", "random", "nerf2_published", None, None), tmp_path, facts)
-    command.report([cell], {"toy": {"nerf2_published": Latency(6e4, 6e4, 1.0, 1)}}, "gsparc", tmp_path)
-    assert "nerf2_published on toy: 60 s a query, timed only" in (tmp_path / "compare.md").read_text()
-    assert len((tmp_path / "compare.csv").read_text().splitlines()) == 1 and shown
 
 
 @pytest.mark.slow
@@ -65,20 +51,18 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
         status, said = compare(tmp_path, only, f"hydra.run.dir={tmp_path / 'other'}")
     assert status == 1 and "another run writes here; wait for its end" in said
     assert "give another cells=" in said and not (tmp_path / "other" / "compare.md").exists()
-    status, said = compare(tmp_path, only, "datasets.own.file=null", "train=false")
-    assert status == 0 and "here as far as results were kept" in said
-    assert "3 cells, 3 of them are there" in said
-    # A cell whose result is not whole does not count.
-    (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
-    cell.write_text("{")
+    # A cell whose result is not whole does not count, nor does one of other data under the same name.
+    (tmp_path / "cells/own/random/mean/any/any/summary.json").write_text("{")
     assert "3 cells, 2 of them are there" in compare(tmp_path, only, "latency=false")[1]
+    spectra(tmp_path / "own.npz", rows=44)
+    assert "3 cells, 0 of them are there" in compare(tmp_path, only, "latency=false", "train=false")[1]
 
 
 PLAIN = "only=[own/random/nearest/*,own/random/gp/*]", "latency=false"
 
 
 def figures(folder) -> list[dict]:
-    facts = [json.loads(file.read_text()) for file in sorted((folder / "cells").glob("*/cell.json"))]
+    facts = [json.loads(file.read_text()) for file in sorted((folder / "cells").rglob("summary.json"))]
     return [{key: value for key, value in one.items() if key.startswith("test/")} for one in facts]
 
 

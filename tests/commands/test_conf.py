@@ -20,9 +20,9 @@ from omegaconf import OmegaConf, open_dict
 import gsparc.conf
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
+from gsparc.field.fit import DEFAULTS
 from gsparc.models.method import Method
 from gsparc.models.registry import build, methods
-from gsparc.training.fit import DEFAULTS
 
 CONF = Path(gsparc.conf.__path__[0])
 GROUPS = ("dataset", "split", "trainer", "callbacks", "logger", "paper", "experiment")  # of train.yaml

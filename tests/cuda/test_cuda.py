@@ -5,8 +5,8 @@ import torch
 from compute_kernels import KIND_SHAPES, assert_equals_reference
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
+from gsparc.field.losses import _Kernel
 from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, networks, operators, rasterize, similarity
-from gsparc.training.losses import _Kernel
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 

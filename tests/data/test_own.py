@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
-from gsparc.training.losses import WINDOW_RADIUS
+from gsparc.field.losses import WINDOW_RADIUS
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])

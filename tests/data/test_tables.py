@@ -2,11 +2,13 @@
 # ruff: noqa: E501 (a case is a row of a table)
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gsparc.data.own import interpret
+from gsparc.data.tables import heads
 from gsparc.data.tables.heads import understand
 from gsparc.data.tables.read import understand_table
 
@@ -56,6 +58,11 @@ def test_the_same_table_in_other_forms(write, content, name):
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81.5])
     assert name != "plain.csv" or arrays["row_name"].tolist() == ["line 2", "line 3"]
+
+
+def test_every_list_of_the_sheet_is_read():
+    code = "".join(file.read_text() for file in Path(heads.__file__).parent.glob("*.py"))
+    assert all(f'"{name}"' in code for name in heads.SHEET)
 
 
 def test_no_value_in_a_level_is_missing(write):

@@ -7,7 +7,7 @@ Remedy: second moments are taken about the target's mean and the variance is flo
 import pytest
 import torch
 
-from gsparc.training.losses import _window, spectrum_loss, ssim
+from gsparc.field.losses import _window, spectrum_loss, ssim
 
 LEVELS = [0.0, 1e-7, 0.6, 0.6 + 1e-7, 1.0]
 

@@ -13,7 +13,7 @@ from campaigns import spectra
 from contexts import trained
 from rasters import GRIDS, origin, random_scene, render
 
-from gsparc.training.losses import spectrum_loss
+from gsparc.field.losses import spectrum_loss
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

@@ -17,10 +17,10 @@ from campaigns import brief, compose, spectra
 from contexts import loaded, short, trained
 from rasters import GRIDS, PROJECTIONS, origin, random_scene, render
 
+from gsparc.field.module import NonFiniteLoss
 from gsparc.models import checkpoint
 from gsparc.models.registry import build
 from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.training.module import NonFiniteLoss
 
 
 class Spoil(L.Callback):

@@ -23,9 +23,9 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.field.module import NonFiniteLoss
+from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Pose
-from gsparc.training.module import NonFiniteLoss
-from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 SITE = invent("spectrum").site
 RECEIVER = Pose.identity(torch.tensor([0.0, 0.0, -2.0]))

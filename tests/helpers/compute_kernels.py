@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsparc.field.losses import _Kernel, _written_out
 from gsparc.ops import _native, backends
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
-from gsparc.training.losses import _Kernel, _written_out
 
 backends.named("cpu")  # the operators find its kernels
 TONES = (2.4e9, 312_500.0)

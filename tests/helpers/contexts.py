@@ -11,10 +11,10 @@ from gsparc.callbacks import Checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.fit import DEFAULTS
 from gsparc.models.method import Method
 from gsparc.models.registry import build
 from gsparc.training.context import FitContext
-from gsparc.training.fit import DEFAULTS
 
 
 def short(

@@ -7,9 +7,9 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
+from gsparc.field.module import GaussianModule, LossSettings
+from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose
-from gsparc.training.module import GaussianModule, LossSettings
-from gsparc.training.optimizer import OptimizerSettings
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 

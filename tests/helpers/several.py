@@ -22,11 +22,11 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.fit import DEFAULTS, run_stage
+from gsparc.field.module import GaussianModule
+from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
-from gsparc.training.fit import DEFAULTS, run_stage
-from gsparc.training.module import GaussianModule
-from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.time_budget import TimeBudget
 
 BATCH = 7  # no multiple of two processes, nor a divisor of the rows

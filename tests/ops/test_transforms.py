@@ -8,10 +8,10 @@ from rasters import poses, random_scene
 from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
+from gsparc.field.losses import ssim
 from gsparc.ops import Cutoff, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
 from gsparc.ops.channels import channels
 from gsparc.ops.networks import networks
-from gsparc.training.losses import ssim
 
 GRID = SphereGrid.hemisphere(9, 18)
 POSE = Pose.identity(torch.zeros(3, dtype=torch.float64))

@@ -109,6 +109,18 @@ def test_silent_rows_stay_known_and_are_counted(many):
     assert heard < unheard
 
 
+def test_back_from_disk(many, tmp_path):
+    data, method = town(160), GaussianProcess()
+    batch, _ = fit(method, data, 140)
+    torch.save(method.state(), tmp_path / "state.pt")
+    again = GaussianProcess()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    said, then = method.predict(batch), again.predict(batch)
+    for part in ("mean", "confidence", "variance"):
+        assert torch.equal(getattr(said, part), getattr(then, part))
+    assert again.label == "gp (Vecchia 30)"
+
+
 def test_slopes_of_the_mean():
     data = town(120)
     rows = rows_of(data, 120)

@@ -212,6 +212,13 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     floor_plan(outcome, tmp_path / "plan.png")
 
 
+def test_walk_has_times(tmp_path):
+    walk = {"kind": "trajectory", "points_m": [[0.5, 0.5], [5.5, 0.5]], "speed_m_s": 1.0, "every_s": 0.2}
+    simulate(plan(scene=replace(SCENE, receivers=walk), shard=26), tmp_path / "walk.h5")
+    stored, _ = arrays(tmp_path / "walk.h5")
+    np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)
+
+
 def test_parts_of_another_simulation_are_refused(tmp_path):
     """Of other settings, or of another table of places: shards are kept by the number of a row."""
     table, out = tmp_path / "places.csv", tmp_path / "box.h5"
@@ -316,6 +323,13 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     assert outcome.convergence.nmse == pytest.approx(1e-4, rel=0.01)
     assert outcome.convergence.power_db == pytest.approx(20 * np.log10(1.01), rel=0.01)
     assert "90,000 rays" in verdict(outcome.choice) and figures(outcome)["auto/samples"] == 90_000
+
+
+def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
+    outcome = simulate(plan(effects=with_rays(monkeypatch, 1.2)), tmp_path / "box.h5")
+    row = outcome.choice.table[-1]
+    assert outcome.choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
+    assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
 
 
 def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):

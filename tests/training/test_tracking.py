@@ -14,7 +14,7 @@ from offline import offline_run
 from PIL import Image
 
 from gsparc.commands.train import main
-from gsparc.training.optimizer import OptimizerSettings
+from gsparc.field.optimizer import OptimizerSettings
 from gsparc.training.tracking import Part, picture, table, tensorboard_logger
 
 COUNTS = {0: 40, 1: 30}  # of Gaussians, in the jobs of the sweep

@@ -108,7 +108,7 @@ class LinkStudy:
             for rows in (self.test, self.aside)
         )
         rates = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
-        return rates, rate_facts(rates, self.accepted, self.score)
+        return rates, rate_facts(rates, self.accepted)
 
     def send(
         self, modulation: str, levels: list[float], tick: Callable[[str], None]

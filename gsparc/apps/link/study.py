@@ -111,7 +111,7 @@ def adapt(
     return rates
 
 
-def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray) -> dict[str, Any]:
     """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
 
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
@@ -121,34 +121,27 @@ def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: n
     for rule, ones in rates.items():
         for one in ones:
             stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
-            facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
+            facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted).items()}
     return facts
 
 
-def _rates_of(one: Rates, accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
-    chosen, oracle, miss = one.chosen_bps, one.oracle_bps, np.abs(one.chosen - one.oracle)
+def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
+    chosen, oracle = one.chosen_bps, one.oracle_bps
     facts: dict[str, Any] = {
         "oracle_mbps": oracle.mean() / 1e6, "best_mbps": one.best_bps.mean() / 1e6,
-        "chosen_mbps": chosen.mean() / 1e6,
-        "shortfall": _shortfall(chosen, oracle), "shortfall_best": _shortfall(chosen, one.best_bps),
+        "chosen_mbps": chosen.mean() / 1e6, "outage": float(one.outage.mean()), "care": one.care,
         # Whoever is not accepted sends pilots, and chooses as the oracle does.
         "shortfall_with_fallback": _shortfall(np.where(accepted, chosen, oracle), oracle),
-        "exact": float((miss == 0).mean()), "off_by_more_than_2": float((miss > 2).mean()),
-        "tbler": float(one.fails.mean()), "outage": float(one.outage.mean()), "care": one.care,
     }  # fmt: skip
-    for share in (0.5, 0.7, 0.9):
-        surest = score >= np.quantile(score, 1 - share)
-        facts[f"shortfall_surest_{share:.0%}"] = _shortfall(chosen[surest], oracle[surest])
-    if np.isfinite(one.regret_bps).all():
-        facts |= _by_regret(one)
-    if accepted.any():
-        facts |= {
-            "shortfall_accepted": _shortfall(chosen[accepted], oracle[accepted]),
-            "shortfall_best_accepted": _shortfall(chosen[accepted], one.best_bps[accepted]),
-            "tbler_accepted": float(one.fails[accepted].mean()),
-            "off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
-        }
-    return facts
+    for name, some in (("", np.ones(len(accepted), bool)), ("_accepted", accepted)):
+        miss = np.abs(one.chosen - one.oracle)[some]
+        own = {
+            "shortfall": _shortfall(chosen[some], oracle[some]),
+            "shortfall_best": _shortfall(chosen[some], one.best_bps[some]),
+            "tbler": float(one.fails[some].mean()), "off_by_more_than_2": float((miss > 2).mean()),
+        } if some.any() else {}  # fmt: skip
+        facts |= {key + name: value for key, value in own.items()}
+    return facts | (_by_regret(one) if np.isfinite(one.regret_bps).all() else {})
 
 
 def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:

@@ -284,10 +284,8 @@ def draw_errors(errors: Mapping[str, np.ndarray], path: Path) -> None:
     """Share of snapshots located to within an error [m], a line a method, as one PNG."""
     figure, ((axis,),) = panels(6, 4)
     for name, values in errors.items():
-        ordered = np.sort(np.maximum(values, 1e-4))
-        share = np.arange(1, len(ordered) + 1) / len(ordered)
         label = f"{name}, median {np.median(values):.3g} m"
-        axis.plot(ordered, share, color=look(name).colour, label=label)
+        axis.ecdf(np.maximum(values, 1e-4), color=look(name).colour, label=label)
     logarithmic(axis)
     axis.set(xlabel="error [m]", ylabel="share of snapshots", ylim=(0, 1))
     axis.legend(fontsize=8)

@@ -8,9 +8,7 @@ distance). Farther than any held-out row nothing is known, and nothing is said.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -59,15 +57,6 @@ class Evidence:
     def error(self) -> np.ndarray:
         """Measured less predicted (n,), in deviations; of censored rows what bounds it."""
         return (self.level_db - self.mean_db) / self.spread_db
-
-    def state(self) -> dict[str, Any]:
-        """For the `extra` of a checkpoint."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, Any]) -> Evidence:
-        """The inverse of `state`."""
-        return cls(*(np.asarray(state[field.name]) for field in fields(cls)))
 
 
 @dataclass(frozen=True)

@@ -271,27 +271,27 @@ class Tour:
 
     def __init__(self, start: np.ndarray | None, longest: float | None) -> None:
         self.start, self.longest = start, longest
-        self._places: list[np.ndarray] = []  # as they were added
-        self._walk: list[int] = []  # their numbers in the order of the walk
+        self.stops, self.number = np.zeros((0, 2)), np.zeros(0, np.int64)  # in the order of the walk
 
     def within(self, places: np.ndarray) -> np.ndarray:
         """Which of places (n, 3) can be added, (n,) bool."""
         if self.longest is None:
             return np.ones(len(places), bool)
-        length = self.length_of(self._stops(), self.start)
-        return self._insertions(places[:, :2]).min(axis=0) + length <= self.longest
+        length = self.length_of(self.stops, self.start)
+        return self._longer(places[:, :2]).min(axis=0) + length <= self.longest
 
     def add(self, place: np.ndarray) -> None:
         """Put a place (3,) where it lengthens the walk least."""
-        at = int(self._insertions(place[None, :2])[:, 0].argmin())
-        self._places.append(place[:2])
-        self._walk.insert(at, len(self._places) - 1)
+        at = int(self._longer(place[None, :2])[:, 0].argmin())
+        self.stops = np.insert(self.stops, at, place[:2], axis=0)
+        self.number = np.insert(self.number, at, len(self.number))
         if self.longest is not None:
-            self._walk = self._shorter()
+            self._shorten()
 
     def order(self) -> np.ndarray:
         """Numbers (n,) int64 of the places, as they were added, in the order of the walk."""
-        return np.array(self._shorter(), np.int64)
+        self._shorten()
+        return self.number
 
     @staticmethod
     def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
@@ -299,25 +299,21 @@ class Tour:
         stops = places[:, :2] if start is None else np.vstack([start, places[:, :2]])
         return float(np.hypot(*np.diff(stops, axis=0).T).sum()) if len(stops) > 1 else 0.0
 
-    def _stops(self) -> np.ndarray:
-        return np.array([self._places[k] for k in self._walk]).reshape(-1, 2)
-
-    def _ends(self, stops: np.ndarray) -> np.ndarray:
+    def _ends(self) -> np.ndarray:
         """Stops (n + 2, 2) with what is before and after them; NaN where there is nothing."""
         nothing = np.full(2, np.nan)
-        return np.vstack([nothing if self.start is None else self.start, stops, nothing])
+        return np.vstack([nothing if self.start is None else self.start, self.stops, nothing])
 
-    def _insertions(self, places: np.ndarray) -> np.ndarray:
+    def _longer(self, places: np.ndarray) -> np.ndarray:
         """What each of places (n, 2) adds to the walk before each stop, or at its end: (stops + 1, n) [m]."""
-        stops = self._ends(self._stops())
+        stops = self._ends()
         to = _apart(stops[:, None], places)
         return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
 
-    def _shorter(self) -> list[int]:
-        """The walk after turning stretches round (G. A. Croes, Oper. Res. 6 (1958)) while that helps."""
-        stops = self._ends(np.array(self._places).reshape(-1, 2))
-        apart = _apart(stops[:, None], stops)
-        walk = [0, *(k + 1 for k in self._walk), len(stops) - 1]  # rows of `stops`
+    def _shorten(self) -> None:
+        """Turn stretches of the walk round (G. A. Croes, Oper. Res. 6 (1958)) while that helps."""
+        stops = self._ends()
+        apart, walk = _apart(stops[:, None], stops), list(range(len(stops)))
         for _ in range(ROUNDS):
             before = list(walk)
             for i in range(1, len(walk) - 2):
@@ -327,7 +323,7 @@ class Tour:
                         walk[i : j + 1] = walk[i : j + 1][::-1]
             if walk == before:
                 break
-        return [k - 1 for k in walk[1:-1]]
+        self.stops, self.number = stops[walk[1:-1]], self.number[np.array(walk[1:-1], int) - 1]
 
 
 def _apart(one: np.ndarray, two: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +79,7 @@ class Promise:
 
     def keep(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
-        own = {"known": self.known, "station": self.station, "block_m": self.block_m}
-        checkpoint.amend(path, {KEY: {**own, "evidence": self.evidence.state()}})
+        checkpoint.amend(path, {KEY: asdict(self)})
 
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
@@ -88,8 +87,8 @@ def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
     state = extra.get(KEY)
     if state is None:
         return None
-    known, station = np.asarray(state["known"]), np.asarray(state["station"])
-    return Promise(Evidence.restored(state["evidence"]), known, station, float(state["block_m"]))
+    evidence = Evidence(**{name: np.asarray(value) for name, value in state["evidence"].items()})
+    return Promise(evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"])
 
 
 def gather(

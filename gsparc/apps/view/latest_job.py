@@ -8,21 +8,21 @@ from collections.abc import Callable, Hashable, Iterator
 
 log = logging.getLogger(__name__)
 
-Job = Callable[[], Iterator[object]]
+Job = Callable[[], Iterator[object]]  # a generator function
+OVER = object()
 
 
 class LatestJobQueue:
     """Runs jobs one step at a time; a job of a key replaces the one before, also in the midst of it.
 
-    A job is a function that returns an iterator: after each `yield` another job may have its turn. Those that
+    A job is a generator function: after each `yield` another job may have its turn. Those that
     are urgent go first, the others follow in rotation, so that a long job does not delay a short one by more
     than one of its steps, and a client that asks often does not keep others waiting.
     """
 
     def __init__(self) -> None:
         self._wake = threading.Condition()
-        self._jobs: dict[Hashable, tuple[bool, Job]] = {}
-        self._begun: dict[Hashable, Iterator[object]] = {}
+        self._jobs: dict[Hashable, tuple[bool, Iterator[object]]] = {}
         self._over = False
         self._thread = threading.Thread(target=self._work, name="gsparc view", daemon=True)
         self._thread.start()
@@ -31,8 +31,7 @@ class LatestJobQueue:
         """Have a job done in place of the key's present one; returns at once."""
         with self._wake:
             self._jobs.pop(key, None)
-            self._begun.pop(key, None)
-            self._jobs[key] = urgent, job
+            self._jobs[key] = urgent, job()
             self._wake.notify_all()
 
     def forget(self, client: Hashable) -> None:
@@ -40,7 +39,6 @@ class LatestJobQueue:
         with self._wake:
             for key in [key for key in self._jobs if isinstance(key, tuple) and key[0] == client]:
                 del self._jobs[key]
-                self._begun.pop(key, None)
 
     def __len__(self) -> int:
         return len(self._jobs)
@@ -61,21 +59,13 @@ class LatestJobQueue:
                     return
                 key = next((key for key, (urgent, _) in self._jobs.items() if urgent), next(iter(self._jobs)))
                 entry = self._jobs[key]
-                begun = self._begun.get(key)
-            step: Iterator[object] = iter(())
+            done = True
             try:
-                step = begun or entry[1]()
-                next(step)
-                done = False
-            except StopIteration:
-                done = True
+                done = next(entry[1], OVER) is OVER
             except Exception:  # one picture less; the next drag draws again
                 log.exception("a step of %s failed", key)
-                done = True
             with self._wake:
-                if self._jobs.get(key) is not entry:
-                    continue  # replaced or forgotten meanwhile
-                del self._jobs[key]  # and back at the end of the rotation
-                self._begun.pop(key, None)
-                if not done:
-                    self._jobs[key], self._begun[key] = entry, step
+                if self._jobs.get(key) is entry:  # neither replaced nor forgotten meanwhile
+                    del self._jobs[key]
+                    if not done:
+                        self._jobs[key] = entry  # at the end of the rotation

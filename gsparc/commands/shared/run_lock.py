@@ -17,8 +17,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.files import set_aside, sweep
+from gsparc.evaluation.summary import SUMMARY
 
-LOCK, HOLDER, SUMMARY = ".lock", ".held-by", "summary.json"
+LOCK, HOLDER = ".lock", ".held-by"
 _locks: list[FileLock] = []  # by the command that is running
 
 

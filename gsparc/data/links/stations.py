@@ -13,6 +13,7 @@ from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 # Of a station's beam, in the order of `Stations.sector`.
 SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db",
           "station_site")  # fmt: skip
+PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)  # of a list of stations, beside their places
 FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 

@@ -13,25 +13,8 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import Caution, some
-from gsparc.data.tables.heads import (
-    AXES,
-    END_WORDS,
-    ENDS,
-    KINDS,
-    LISTS,
-    MANY,
-    OTHER_NAMES,
-    PERCENT,
-    SHEET,
-    STATION_WORDS,
-    TOGETHER,
-    Head,
-    about,
-    suits,
-    understand,
-    unit_of,
-    words_of,
-)
+from gsparc.data.tables import heads
+from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, suits, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import SCHEMA, UNITS, Unit, known
 
@@ -41,7 +24,7 @@ MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
 ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
 LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
-_STATIONS = "|".join(sorted(STATION_WORDS))
+_STATIONS = "|".join(sorted(heads.STATION_WORDS))
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
 REPEATED = 4  # rows for each name of a column that may hold stations
 
@@ -66,7 +49,7 @@ class Column(Head):
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
             wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
-            remedy = PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
+            remedy = heads.PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
         marks = self.role == "rssi_db"
         return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), marks)
@@ -100,11 +83,11 @@ def choose(
     used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = understand(head) if head and head not in used_heads else Head()
+        meaning = heads.understand(head) if head and head not in used_heads else Head()
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
-        areas = TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
+        areas = heads.TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
         alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
         if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
             continue
@@ -120,7 +103,7 @@ def choose(
             candidates = _identity(sheet, candidates, always=only is not None)
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
         one_each = tones or "station" not in {**chosen, **guesses}
-        several = role in MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
+        several = role in heads.MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
         several &= len({column.word for column in candidates}) == 1
         several |= role == "station" and candidates[0].label == JOINED
         exact = [column for column in candidates if column.head == role]
@@ -150,17 +133,10 @@ def choose(
 JOINED = "joined"  # label of columns whose values together name a station
 
 
-def station_names(sheet: Sheet, columns: Iterable[Column]) -> np.ndarray:
-    """Text (S,): what the rows call their station, values of several columns joined; empty where nothing."""
-    parts = [sheet.words(column.head or "") for column in columns]
-    names = [" ".join(filter(None, row)) if row[0] else "" for row in zip(*parts, strict=True)]
-    return np.array(names, dtype=str)
-
-
 def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Column]:
     """A station's column and those that tell it from others of its name, `always` or where some do."""
     for first in candidates:
-        parts = TOGETHER.get(first.word, set())
+        parts = heads.TOGETHER.get(first.word, set())
         bare = {head: set(words_of(head)) - LESS for head in sheet.heads if head != first.head}
         more = [head for head, words in bare.items() if words and words <= parts]
         if not parts or not all(column is first or column.head in more for column in candidates):
@@ -168,7 +144,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
         columns = [first]
         for head in more:
             longer = [*columns, replace(first, head=head)]
-            fewer, many = (len(set(station_names(sheet, some).tolist())) for some in (columns, longer))
+            fewer, many = (len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer))
             if always or fewer < many <= len(sheet) // REPEATED:
                 columns = longer
         return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
@@ -182,10 +158,10 @@ NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS})[\W_]*[a-z]?\d+[\W_]*$")
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
     """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
     used = {column.head for columns in chosen.values() for column in columns}
-    heads = [head for head in sheet.heads if head not in used and (MAC.search(head) or NAMED.match(head))]
-    if not heads or "station" in chosen:
+    alike = [head for head in sheet.heads if head not in used and (MAC.search(head) or NAMED.match(head))]
+    if not alike or "station" in chosen:
         return []
-    chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in heads)
+    chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
     return [_note(chosen["rssi_db"])]
 
 
@@ -193,11 +169,11 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
     """Warnings of columns that are not used though their heads speak of something that matters."""
     stations = chosen.get("station", ())
     notes: list[str] = []
-    names = station_names(sheet, stations) if stations else np.zeros(len(sheet), str)
-    have = {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
+    names = sheet.joined(c.head for c in stations) if stations else np.zeros(len(sheet), str)
+    ends, have = set(heads.END_WORDS), {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
     for head in sheet.heads:
         lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
-        topic = about(head) or ("a station" if lone and set(words_of(head)) & set(END_WORDS) else None)
+        topic = heads.about(head) or ("a station" if lone and ends & set(words_of(head)) else None)
         if topic is None or head in used:
             if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
                 say = f"dataset.columns.z={head}*3.2 takes 3.2 m each"
@@ -211,15 +187,15 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
         groups = len({name for name, _ in pairs}) if wanted != "z" else 1
         if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
             joined = "+".join([*(column.head or "" for column in stations), head])
-            how = SHEET["remedies"][topic].format(head=head, joined=joined)
+            how = heads.SHEET["remedies"][topic].format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
     return notes
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
-    role, where = OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
+    role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
-        close = difflib.get_close_matches(key, [*KINDS, *OTHER_NAMES], 1, 0.4)
+        close = difflib.get_close_matches(key, [*KINDS, *heads.OTHER_NAMES], 1, 0.4)
         hint = f"; did you mean {close[0]}?" if close else f"; known are {', '.join(KINDS)}"
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
@@ -235,18 +211,18 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     joined = [_head(sheet, part.strip()) for part in text.split("+")] if role == "station" else []
     if len(joined) > 1 and all(joined):
         return tuple(Column(role, JOINED, head=part) for part in joined)
-    if "*" in text and role in MANY:
-        heads = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
+    if "*" in text and role in heads.MANY:
+        named = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
         before, _, after = text.partition("*")
-        labels = [h[len(before) : len(h) - len(after)] for h in heads]
-        if heads and "*" not in after:
+        labels = [h[len(before) : len(h) - len(after)] for h in named]
+        if named and "*" not in after:
             labels = [unit_of(label)[0].strip() for label in labels]
-            pairs = zip(heads, labels, strict=True)
+            pairs = zip(named, labels, strict=True)
             return tuple(Column(role, label, _unit(h, role), head=h) for h, label in pairs)
         fault = "expected one * only" if "*" in after else "no column is called so"
         return sheet.problems.add(where, fault) or ()
     numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
-    constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in MANY
+    constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
         return (Column(role, value=numbers),)
     close = difflib.get_close_matches(text.lower(), [h.lower() for h in sheet.heads], 1, 0.4)
@@ -327,11 +303,11 @@ def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
 
 
 def _names(columns: Iterable[Column]) -> str:
-    heads = [repr(column.head) for column in columns]
-    if len(heads) > 4:
-        heads = [*heads[:3], f"{len(heads) - 3} more"]
-    plural = f"columns {', '.join(heads[:-1])} and {heads[-1]}"
-    return plural if len(heads) > 1 else f"column {heads[0]}"
+    quoted = [repr(column.head) for column in columns]
+    if len(quoted) > 4:
+        quoted = [*quoted[:3], f"{len(quoted) - 3} more"]
+    plural = f"columns {', '.join(quoted[:-1])} and {quoted[-1]}"
+    return plural if len(quoted) > 1 else f"column {quoted[0]}"
 
 
 def _note(columns: tuple[Column, ...]) -> str:
@@ -357,7 +333,7 @@ def schema_unit(column: Column) -> str:
 
 def as_station(column: Column) -> Column:
     """The same column of a list of stations, where ends need not be named."""
-    axis = next((a for a in AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
+    axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
     return column if axis is None else replace(column, role=f"station_{axis}")
 
 

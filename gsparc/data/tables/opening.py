@@ -18,7 +18,7 @@ from fsspec.core import url_to_fs
 from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
 from gsparc.data.files import Several, checked_line
 from gsparc.data.tables import TABLE_SUFFIXES
-from gsparc.data.tables.heads import understand
+from gsparc.data.tables.heads import SHEET, understand
 from gsparc.data.tables.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -68,20 +68,6 @@ DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": 
 THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
 LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
 COMMENTS = ("#", "%", "//")
-# What files of other kinds begin with: the name may say .csv all the same.
-OTHERS = {
-    b"PK\x03\x04": "an Excel workbook or another zip archive; save it as CSV",
-    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save it as CSV",
-    b"PAR1": "a Parquet file; name it *.parquet",
-    b"\x1f\x8b": "compressed by gzip; unpack it first",
-    b"\x89HDF": "an HDF5 file; name it *.h5",
-    b"%PDF": "a PDF document; save the table as CSV",
-    b"<": "HTML or XML; save the table as CSV",
-    b"{": "JSON; save the table as CSV",
-    b"[{": "JSON; save the table as CSV",
-}
-
-
 MOST_BYTES = 2**30  # of a table of text
 MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
 MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
@@ -145,8 +131,8 @@ def _decoded(path: Path) -> tuple[str, str]:
     if path.stat().st_size > MOST_BYTES:
         raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
     content = path.read_bytes()
-    for start, what in OTHERS.items():
-        if content.lstrip().startswith(start):
+    for start, what in SHEET["others"].items():
+        if content.lstrip().startswith(start.encode("latin-1")):
             raise DataError(f"{path}: not a table of text but {what}")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:

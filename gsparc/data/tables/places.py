@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gsparc.data.errors import Caution, some
-from gsparc.data.links.stations import SECTOR
-from gsparc.data.tables.columns import Chosen, as_station, choose, station_names
+from gsparc.data.links.stations import PER_STATION, SECTOR
+from gsparc.data.tables.columns import Chosen, as_station, choose
 from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand, words_of
 from gsparc.data.tables.sectors import TILTS, meaning, read_sectors, sites_of
 from gsparc.data.tables.sheet import Sheet
@@ -134,7 +134,6 @@ def one_each(
 
 
 LEAST_LISTED = 10  # stations of a drive: of fewer, one that the list lacks is a mistake
-PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         if not sheet.problems:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None, notes
-    names = station_names(sheet, chosen["station"])
+    names = sheet.joined(c.head for c in chosen["station"])
     other = [each for each in (_named(sheet, heads) for heads in aliases) if len(set(each)) == len(each)]
     if other and len(set(names.tolist())) < len(names) and (names != "").all():
         names = np.array(other[0])

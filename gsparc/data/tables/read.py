@@ -14,32 +14,15 @@ import pandas as pd
 from gsparc.data.checks.outliers import two_groups
 from gsparc.data.errors import Caution, nearest, some
 from gsparc.data.files import Several
+from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS
 from gsparc.data.tables.cells import LOOKED_AT, merged
-from gsparc.data.tables.columns import (
-    CHANNELS,
-    JOINED,
-    LEVELS,
-    POLAR,
-    Chosen,
-    Column,
-    choose,
-    schema_unit,
-    station_names,
-)
+from gsparc.data.tables.columns import CHANNELS, JOINED, LEVELS, POLAR, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.heads import LISTS, PERCENT, words_of
 from gsparc.data.tables.opening import read_parquet, sheet_of
-from gsparc.data.tables.places import (
-    PER_STATION,
-    UNKNOWN_HEIGHT,
-    Places,
-    StationList,
-    one_each,
-    places,
-    read_stations,
-)
+from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, StationList, one_each, places, read_stations
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.tables.slots import unfolded
 from gsparc.data.tables.splitting import splitting
@@ -285,7 +268,7 @@ class Builder:
             if where is None:
                 where = self._second_in_degrees(end_places)
             return None if where is None else self._unnamed(where)
-        words, head = station_names(self.sheet, columns), columns[0].head or ""
+        words, head = self.sheet.joined(c.head for c in columns), columns[0].head or ""
         if self.listed is not None:
             plain = self.sheet.words(head)
             listed, joined = self.listed.called(plain), self.listed.called(words)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,6 +74,12 @@ class Sheet:
         text = column.astype(str).str.strip().to_numpy(dtype=object)
         empty = missing | np.isin(np.char.lower(text.astype(str)), SHEET["missing"])
         return np.where(empty, "", text).astype(str)
+
+    def joined(self, heads: Iterable[str | None]) -> np.ndarray:
+        """Text (S,) of several columns together; empty where the first is."""
+        parts = [self.words(head or "") for head in heads]
+        names = [" ".join(filter(None, row)) if row[0] else "" for row in zip(*parts, strict=True)]
+        return np.array(names, dtype=str)
 
     def numbers(
         self,

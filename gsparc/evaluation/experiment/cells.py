@@ -1,19 +1,12 @@
-"""Which trainings a comparison consists of, and when one that was done before is still the same."""
+"""Which trainings a comparison consists of."""
 
 from __future__ import annotations
 
-import ast
-import functools
-import hashlib
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
 
-from gsparc.data.instantiate import find, plugins, targets
+from gsparc.data.instantiate import find, plugins
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models.registry import methods
 
@@ -32,7 +25,6 @@ class Contender:
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
         only_longest: too slow for any but the longest budget.
-        timed_only: too slow to be scored at all: fitted for its latency.
     """
 
     name: str
@@ -42,7 +34,6 @@ class Contender:
     stations: bool = False
     scene: bool = False
     only_longest: bool = False
-    timed_only: bool = False
 
     def serves(self, problem: Problem) -> bool:
         """Whether it can take part."""
@@ -153,63 +144,3 @@ def plan(
         for one, name in zip(cells, names, strict=True)
         if not only or any(fnmatchcase(name, pattern) for pattern in only)
     ]
-
-
-def key(model: Mapping[str, Any], trainer: Mapping[str, Any], *hashes: str) -> str:
-    """Name of a result: what it was learned from, by what settings and by which program text.
-
-    Args:
-        model: its whole configuration.
-        trainer: settings of the training around it, where it has any.
-        hashes: see `Problem`.
-    """
-    text = json.dumps([model, trainer, *hashes, code_version(model)], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-def code_version(model: Mapping[str, Any]) -> str:
-    """Hash of the program text behind a model's configuration.
-
-    That is every class it names, their bases, and what these import from their own packages. The shared
-    ground (rasterizer, loaders, metrics) is not part of it: having changed that, start with an empty folder.
-    """
-    named = {base.__module__ for path in targets(model) for base in find(path).__mro__}
-    own = {"gsparc", *(str(path).partition(".")[0] for path in targets(model))}  # plugins have texts too
-    open_ends = {name for name in named if name.partition(".")[0] in own} - {"gsparc.models.method"}
-    sources: dict[str, str] = {}
-    while open_ends:
-        name = open_ends.pop()
-        spec = find_spec(name)
-        if name in sources or spec is None or spec.origin is None or spec.submodule_search_locations:
-            continue
-        file = Path(spec.origin)
-        sources[name], imported = _program(file, file.stat().st_mtime_ns)
-        package = name.rpartition(".")[0]
-        open_ends |= {m for m in imported if package and m.rpartition(".")[0] == package}
-    return hashlib.sha256(json.dumps(sources, sort_keys=True).encode()).hexdigest()[:12]
-
-
-@functools.cache
-def _program(file: Path, changed_ns: int) -> tuple[str, frozenset[str]]:
-    """A module's meaning and what it imports, read once for all cells while the file stays as it is."""
-    tree = ast.parse(file.read_bytes())
-    return _meaning(tree), frozenset(_imports(tree))
-
-
-def _meaning(tree: ast.Module) -> str:
-    """The program without layout, comments and docstrings: better words do not make another method."""
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
-            value = body[0].value
-            if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                body[0] = ast.Pass()
-    return ast.dump(tree)
-
-
-def _imports(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)

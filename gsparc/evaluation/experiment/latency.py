@@ -51,7 +51,7 @@ class Latency:
 
 def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     """One row per method, from the first of its checkpoints."""
-    data, split = problem.present()
+    data, split = problem.data, problem.folds
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
@@ -87,16 +87,9 @@ def timed_here(
     for dataset in dict.fromkeys(one.cell.dataset for one in filled):
         here = [one for one in filled if one.cell.dataset == dataset]
         split, file = here[0].cell.split, cells_dir / f"latency-{dataset}.json"
-        first = [one for one in here if one.cell.split == split]
-        present = [one for one in first if one.checkpoint.exists()]
-        absent = {o.cell.method for o in first} - {o.cell.method for o in present}
+        present = [one for one in here if one.cell.split == split and one.checkpoint.exists()]
         stored = json.loads(file.read_text()) if file.exists() else {}
-        if measure and absent and stored:
-            log.warning(
-                "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
-                dataset, ", ".join(sorted(absent)),
-            )  # fmt: skip
-        elif measure and present and problems[dataset, split].data is not None:
+        if measure and present:
             log.info("%s: timing single queries of every method in turns", dataset)
             by_dataset[dataset] = latencies(present, problems[dataset, split])
             rows = {name: asdict(one) for name, one in by_dataset[dataset].items()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ from omegaconf import DictConfig
 from rich.table import Table
 
 from gsparc.evaluation.console import one_line
+from gsparc.evaluation.experiment.done import State, once
 from gsparc.evaluation.experiment.fitting import Filled
-from gsparc.evaluation.experiment.problem import facts_of
-from gsparc.evaluation.summary import provenance, table
+from gsparc.evaluation.summary import table
 
 log = logging.getLogger(__name__)
 
@@ -54,8 +53,7 @@ def compare_places(
     for name, file in settings["fingerprints"].items():
         for split in settings["splits"]:
             chosen = {"dataset": "fingerprints", "dataset.file": file, "dataset.split": split}
-            mark = sha256(Path(file).read_bytes()).hexdigest()[:20]
-            jobs.append(((name, split, "field"), cells_dir / f"{name}-{split}-field-{mark}", chosen))
+            jobs.append(((name, split, "field"), cells_dir / name / split / "field", chosen))
     rows: list[dict[str, Any]] = []
     for names, folder, chosen in jobs:
         try:
@@ -82,14 +80,10 @@ def facts_and_table(errors: pd.DataFrame) -> tuple[dict[str, Any], Table]:
 
 
 def _facts(folder: Path, choices: Mapping[str, Any], locate: Locate) -> dict[str, Any]:
-    """Of one localisation, which is done once by this commit of the program."""
+    """Of one localisation, which is done once."""
     overrides = [f"{name}={_quoted(value)}" for name, value in choices.items()]
-    here = folder / f"locate-{sha256(repr((provenance(), overrides)).encode()).hexdigest()[:12]}"
-    stored = facts_of(here / "summary.json")
-    if stored is None:
-        here.mkdir(parents=True, exist_ok=True)
-        stored = locate(hydra.compose("locate", [*overrides, "hydra.run.dir=."]), here)
-    return stored
+    config, here = hydra.compose("locate", [*overrides, "hydra.run.dir=."]), folder / "locate"
+    return once(here, State.of(config), lambda left: locate(config, here))
 
 
 def _rows(names: tuple[str, str, str], facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import functools
-import json
 import logging
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from inspect import signature
-from pathlib import Path
 from typing import Any, TypeVar
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.assemble import identity
 from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import found
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
+from gsparc.evaluation.experiment.done import content
 from gsparc.models.registry import complete
 from gsparc.simulate.scenes.build import names_scene
 
 log = logging.getLogger(__name__)
 
-RESULT = "cell.json"
 Entry = TypeVar("Entry")
 
 
@@ -61,41 +57,39 @@ class SplitChoice:
 
 @dataclass(frozen=True)
 class Problem:
-    """One dataset under one draw of a split; its measurements may be absent, then kept results say what they
-    were.
+    """One dataset under one draw of a split.
 
     Attributes:
         dataset, split: names.
-        kind: of the measurements.
-        hashes: of the measurements alone, of the folds, and of the former with every fact of their site.
-        draw: number of the split's draw; None where it is not drawn again.
-        stations: whether there are several.
-        scene: whether they name a scene that a ray tracer loads.
         chosen: overrides of train.yaml for dataset and split, but for the draw.
-        data: measurements; None where they are not here.
+        data: measurements.
         folds: which rows learn and which test.
+        content: hash of the measurements, see `done.content`.
+        draw: number of the split's draw; None where it is not drawn again.
     """
 
     dataset: str
     split: str
-    kind: str
-    hashes: tuple[str, str, str]
+    chosen: tuple[str, ...]
+    data: Measurements
+    folds: Split
+    content: str = ""
     draw: int | None = None
-    stations: bool = False
-    scene: bool = False
-    chosen: tuple[str, ...] = ()
-    data: Measurements | None = None
-    folds: Split | None = None
 
-    def present(self) -> tuple[Measurements, Split]:
-        """Measurements and folds.
+    @property
+    def kind(self) -> Scored:
+        """Of the measurements."""
+        return self.data.site.scored
 
-        Raises:
-            ValueError: they are not here.
-        """
-        if self.data is None or self.folds is None:
-            raise ValueError(f"{self.dataset}/{self.split}: the measurements are not here")
-        return self.data, self.folds
+    @property
+    def stations(self) -> bool:
+        """Whether there are several, of which rows of each are learned from."""
+        return self.data.site.stations is not None and self.folds.name != "stations"
+
+    @property
+    def scene(self) -> bool:
+        """Whether the measurements name a scene that a ray tracer loads."""
+        return names_scene(self.data.provenance)
 
 
 def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
@@ -118,51 +112,17 @@ def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> di
 
 def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
     """Load what `conf/dataset` names, with the given settings, once for all draws of all splits."""
-    data: Measurements | None = None
+    read: tuple[Measurements, str] | None = None
     problems = []
     for split in splits:
         chosen = (f"dataset={settings.get('dataset', name)}", *split.overrides)
         for draw in split.numbers:
             config = compose(settings, chosen, draw)
-            data = load(plain(config.dataset)) if data is None else data
-            folds = split_for(plain(config.split), data)
-            hashes = (data.site.sha256, folds.sha256, identity(data))
-            several = data.site.stations is not None and folds.name != "stations"
-            known = names_scene(data.provenance)
-            problems.append(
-                Problem(name, split.name, data.site.scored, hashes, draw, several, known, chosen, data, folds)
-            )
-    return problems
-
-
-def facts_of(result: Path) -> dict[str, Any] | None:
-    """What a kept result says; None where there is none, or no whole one."""
-    try:
-        facts: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return facts
-
-
-def stored_problems(cells_dir: Path, dataset: str, splits: Sequence[SplitChoice]) -> list[Problem]:
-    """The problems of a dataset that most kept results are of, one per draw of a split."""
-    problems = []
-    for split in splits:
-        files = sorted(cells_dir.glob(f"{dataset}-{split.name}-*/{RESULT}"))
-        facts = [one for file in files if (one := facts_of(file)) is not None]
-        for draw in split.numbers:
-            known = Counter(
-                (
-                    f["dataset/kind"],
-                    (f["dataset/sha256"], f["split/sha256"], f.get("dataset/identity", "")),  # once not kept
-                    *(bool(f.get(f"problem/{of}")) for of in ("stations", "scene")),
-                )
-                for f in facts
-                if draw is None or f["seed"] == draw
-            )
-            if known:
-                kind, hashes, several, scene = known.most_common(1)[0][0]
-                problems.append(Problem(dataset, split.name, kind, hashes, draw, several, scene))
+            if read is None:
+                data = load(plain(config.dataset))
+                read = data, content(data)
+            folds = split_for(plain(config.split), read[0])
+            problems.append(Problem(name, split.name, chosen, read[0], folds, read[1], draw))
     return problems
 
 
@@ -189,47 +149,41 @@ def compose(
 @functools.cache
 def _composed(overrides: tuple[str, ...]) -> DictConfig:
     """Composing takes half a second, and draws differ in numbers only."""
-    chosen = ["logger=none", "~callbacks.pictures", *overrides]
+    chosen = ["logger=none", "baselines=[]", "~callbacks.pictures", *overrides]
     config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
     complete(config.model)
     return config
 
 
-def problems_of(settings: Mapping[str, Any], cells_dir: Path) -> list[Problem]:
+def problems_of(settings: Mapping[str, Any]) -> list[Problem]:
     """Every dataset under every split that is meant for it, first draws first: the best-known come first.
 
-    Without its path a dataset is there as far as results were kept, for the table alone.
+    Raises:
+        ValueError: no dataset has a path, or none of those that have one is wanted.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
     splits = named("splits", SplitChoice, settings["splits"])
-    problems: list[Problem] = []
-    absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
-    paths = {
-        name: [path or found(of.get("dataset", name)) for key, path in of.items() if key in ("root", "file")]
-        for name, of in ((name, of or {}) for name, of in settings["datasets"].items())
-    }
-    here = {name: not of or any(of) for name, of in paths.items()}  # a plugin's dataset may need no path
-    for name, own in settings["datasets"].items():
+    problems, absent = list[Problem](), list[str]()
+    for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
+        paths = [
+            path or found(own.get("dataset", name)) for key, path in own.items() if key in ("root", "file")
+        ]
+        if own and not any(paths):  # a plugin's dataset may need no path
+            absent.append(name)
+            continue
         meant = [
             split
             for split in splits.values()
             if (not split.datasets or name in split.datasets)
             and (not wanted or any(_may_match(p, name, split.name) for p in wanted))
         ]
-        if here[name]:
-            problems += load_problems(name, own, meant) if meant else []
-            continue
-        stored = stored_problems(cells_dir, name, meant)
-        problems += stored
-        absent["here as far as results were kept" if stored else "left out"].append(name)
-    for how, names in absent.items():
-        if names:
-            log.warning(
-                "%s %s: say datasets.NAME.root=DIR or .file=FILE, or gsparc data", ", ".join(names), how
-            )
+        problems += load_problems(name, own, meant) if meant else []
+    if absent:
+        how = "left out: say datasets.NAME.root=DIR or .file=FILE, or gsparc data"
+        log.warning("%s %s", ", ".join(absent), how)
     order = list(splits)
     problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
-    if not problems and not any(here.values()):
+    if not problems and len(absent) == len(settings["datasets"]):
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
     if not problems:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")

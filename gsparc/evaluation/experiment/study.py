@@ -6,15 +6,20 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 
+from gsparc.data.executor import each
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.experiment.done import State, once
 from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
+from gsparc.evaluation.summary import SUMMARY, provenance, write_summary
+from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.refined_places import displaced as elsewhere
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
@@ -22,6 +27,7 @@ from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
+OF_CELL = ("effects", "rows", "value", "train_s", "train_cpu_s")
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
 
 
@@ -45,6 +51,21 @@ class Condition:
     def changes_training(self) -> bool:
         """Whether it changes what is learned from."""
         return self.what not in ("none", "query")
+
+    @property
+    def learned(self) -> Condition:
+        """The condition whose training stands for this one's."""
+        return self if self.changes_training else Condition()
+
+    def model(self, folder: Path) -> Path:
+        """Where the model that was trained so is, in the folder of its cell."""
+        return folder / str(self.learned).replace(" ", "-") / checkpoint.MODEL
+
+    def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+        """Its part of a cell's summary."""
+        own = {name: facts[f"{self}/{name}"] for name in OF_CELL}
+        model = str(self.model(folder))
+        return {"what": self.what, "amount": self.amount, "figure": facts["figure"], "model": model, **own}
 
     def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Data and rows of a fold under this condition."""
@@ -107,12 +128,15 @@ class Study:
         if self.base is not None and self.base not in self.variants:
             raise ValueError(f"base={self.base}: no such variant; there are {', '.join(self.variants)}")
 
-    def run(self, data: Measurements, split: Split, context: FitContext) -> pd.DataFrame:
+    def run(self, data: Measurements, split: Split, context: FitContext, state: State) -> pd.DataFrame:
         """Fit, score and time everything; a variant that the data do not allow is left out.
+
+        A round of a variant is a cell with a folder of its own, which is done once.
 
         Args:
             data, split: as they are before any condition.
             context: of every fit, but for its folder and seed.
+            state: that results are of.
 
         Returns:
             A row per variant and condition, columns `ROW` (those of `study.csv`).
@@ -126,73 +150,87 @@ class Study:
         Raises:
             ValueError: the base variant, or every variant, cannot be trained here.
         """
-        outcomes: dict[tuple[str, Condition], list[Outcome]] = {}
-        allowed = list(self.variants)
-        for turn in range(self.rounds):
-            for variant in list(allowed):
-                try:
-                    by_condition = self._outcomes(variant, data, split, context, turn)
-                except ValueError as refused:
-                    if variant == self.base or REFUSED not in str(refused) or len(allowed) == 1:
-                        raise
-                    log.info("%s is left out: %s", variant, refused)
-                    allowed.remove(variant)
-                    continue
-                for condition, outcome in by_condition.items():
-                    outcomes.setdefault((variant, condition), []).append(outcome)
-        return self._rows(outcomes, data, split)
+        cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
+        work = partial(self._tried, data=data, split=split, context=context, state=state)
+        found = dict(each(work, cells, "rounds of variants"))
+        rows = list[dict[str, Any]]()
+        for number, (variant, turn) in enumerate(cells):
+            facts, folder = found[number], context.run_dir / variant / str(turn)
+            if not isinstance(facts, str):
+                rows += [
+                    {"variant": variant, "turn": turn, **one.row(facts, folder)} for one in self.conditions
+                ]
+            elif variant == self.base or not any(isinstance(one, dict) for one in found.values()):
+                raise ValueError(facts)
+            elif turn == 0:
+                log.info("%s is left out: %s", variant, facts)
+        return self._table(pd.DataFrame(rows), data, split)
 
-    def _outcomes(
-        self, variant: str, data: Measurements, split: Split, context: FitContext, turn: int
-    ) -> dict[Condition, Outcome]:
-        """One training per condition that changes what is learned from."""
-        by_condition: dict[Condition, Outcome] = {}
-        seed, plain = self.seed + turn, None
+    def _tried(
+        self, cell: tuple[str, int], data: Measurements, split: Split, context: FitContext, state: State
+    ) -> dict[str, Any] | str:
+        """The facts of a cell, or why the data do not allow it."""
+        folder = context.run_dir / cell[0] / str(cell[1])
+        try:
+            return once(folder, state, lambda left: self._done(*cell, folder, data, split, context))
+        except ValueError as refused:
+            if REFUSED not in str(refused):
+                raise
+            return str(refused)
+
+    def _done(
+        self, variant: str, turn: int, folder: Path, data: Measurements, split: Split, context: FitContext
+    ) -> None:
+        """One training per condition that changes what is learned from, scored under all of them."""
+        seed, figure, facts = self.seed + turn, DECIDING[data.site.scored], dict[str, Any]()
+        fits: dict[Condition, Outcome] = {}
         for condition in self.conditions:
-            outcome = plain
-            if outcome is None or condition.changes_training:
-                folder = context.run_dir / variant / str(condition).replace(" ", "-") / str(turn)
-                contexts = in_folders(replace(context, run_dir=folder, seed=seed), split)
-                learned_from = partial(condition.learned_from, seed=seed)
-                fits = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
-                outcome = fits.scored_on(data, split)
-                plain = plain if condition.changes_training else outcome
+            learned = condition.learned
+            if learned not in fits:
+                contexts = in_folders(
+                    replace(context, run_dir=learned.model(folder).parent, seed=seed), split
+                )
+                learned_from = partial(learned.learned_from, seed=seed)
+                made = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
+                fits[learned] = made.scored_on(data, split)
+                extra = {"fold": 0, "split_sha256": split.sha256}
+                checkpoint.save(learned.model(folder), made.methods[0], context.config_yaml, extra)
+            outcome = fits[learned]
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
-            by_condition[condition] = outcome
-            figure = DECIDING[data.site.scored]
+            folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
+            own = {
+                "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
+                "value": _value(outcome, figure), "train_s": float(np.mean(outcome.train_s)),
+                "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
+                "effects": str(outcome.methods[0].effects or "none"),
+            }  # fmt: skip
+            facts |= {f"{condition}/{name}": value for name, value in own.items()}
             log.info(
                 "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
-                variant, condition, turn + 1, self.rounds, figure, _value(outcome, figure),
-                sum(outcome.train_s),
+                variant, condition, turn + 1, self.rounds, figure, own["value"], sum(outcome.train_s),
             )  # fmt: skip
-        return by_condition
+        write_summary(folder / SUMMARY, {"figure": figure, "seed": seed, **facts, **provenance()})
 
-    def _rows(
-        self, outcomes: Mapping[tuple[str, Condition], list[Outcome]], data: Measurements, split: Split
-    ) -> pd.DataFrame:
-        figure = DECIDING[data.site.scored]
+    def _table(self, cells: pd.DataFrame, data: Measurements, split: Split) -> pd.DataFrame:
+        """Rounds put together, and the models of the last one timed."""
+        cells["train_ratio"] = self._ratio(cells, "train_s", ["turn", "what", "amount"])
+        last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
+        median = {name: (name, "median") for name in ("train_s", "train_cpu_s", "train_ratio")}
+        groups = cells.groupby(["variant", "what", "amount"], sort=False)
+        rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
-        methods = {str(id(o[-1].methods[0])): o[-1].methods[0] for o in outcomes.values()}
+        methods = {file: loading.load(file)[0] for file in dict.fromkeys(rows.model)}
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
-        query = {key: percentiles(times[str(id(o[-1].methods[0]))]) for key, o in outcomes.items()}
-        train = {key: np.array([np.mean(one.train_s) for one in o]) for key, o in outcomes.items()}
-        rows = []
-        for key, rounds in outcomes.items():
-            variant, condition = key
-            values = np.array([_value(one, figure) for one in rounds])
-            base = (self.base or "", condition)
-            compared = base in outcomes
-            folds = [condition.learned_from(data, fold, self.seed)[1] for fold in split.folds]
-            rows.append((
-                variant, condition.what, condition.amount, str(rounds[-1].methods[0].effects or "none"),
-                float(np.mean([len(fold.train) + len(fold.val) for fold in folds])), figure, values.mean(),
-                values.std(ddof=1) if len(values) > 1 else np.nan, np.median(train[key]),
-                np.median([np.mean(one.train_cpu_s) for one in rounds]),
-                np.median(train[key] / train[base]) if compared else np.nan, *query[key],
-                query[key][0] / query[base][0] if compared else np.nan,
-            ))  # fmt: skip
-        return pd.DataFrame(rows, columns=ROW)
+        rows[["query_ms", "query_p95_ms"]] = [percentiles(times[file]) for file in rows.model]
+        rows["query_ratio"] = self._ratio(rows, "query_ms", ["what", "amount"])
+        return rows[list(ROW)]
+
+    def _ratio(self, rows: pd.DataFrame, column: str, same: list[str]) -> Any:
+        """Of each row (n,) to the base variant's where these columns are the same; NaN without."""
+        base = rows[rows.variant == self.base].set_index(same)[column].to_dict()
+        own = rows[same].itertuples(index=False, name=None)
+        return rows[column].to_numpy() / [base.get(key, np.nan) for key in own]
 
 
 def _value(outcome: Outcome, figure: str) -> float:

@@ -31,11 +31,9 @@ ROW = [
 
 
 def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
-    """Every scored cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
+    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
     rows = []
     for one in filled:
-        if not one.scored():
-            continue
         facts, kind = one.facts, one.facts["dataset/kind"]
         figure, second = DECIDING[kind], SECOND[kind]
         label = str(facts.get("model/label") or "")
@@ -46,7 +44,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
             "score_db": score_db(kind, facts) + 0.0,  # -0.0 would be shown as such
             "coverage": facts.get("test/interval/coverage_90"), "outage": facts.get("test/outage/brier"),
             "after_constant": facts.get("test/rmse_db_after_constant"), "second": second,
-            "second_value": facts.get(f"test/{second}"), "earlier": one.earlier or "",
+            "second_value": facts.get(f"test/{second}"), "earlier": one.earlier,
             "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
     if not rows:
@@ -57,7 +55,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
 
 
 def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
-    """The scored cells of a method under one budget, averaged over seeds or over draws of the split.
+    """The cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
@@ -76,7 +74,7 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         `train_s`, `train_cpu_s`: seconds of training per model, on the clock and of the processor.
         `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same rounds.
         `load`: 1-minute load per core at the end of the training.
-        `earlier`: commits of earlier program text that it was measured with.
+        `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
     cells = cells_of(filled)
@@ -169,7 +167,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
-        lines.append(f"measured before the program or its settings were last changed (at commit): {old}")
+        lines.append(f"measured with another program (at commit): {old}")
     load = block.load[block.budget_s.notna()].max()
     if load > BUSY:
         lines.append(
@@ -179,19 +177,9 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     return lines
 
 
-def markdown(
-    blocks: Sequence[pd.DataFrame], ours: str, timed: Mapping[str, Mapping[str, Latency]] | None = None
-) -> str:
-    """All blocks as one page, and what was timed but is too slow to be scored."""
-    pages = [_page(block, ours) for block in blocks]
-    scored = {name for block in blocks for name in block.method}
-    pages += [
-        f"{name} on {dataset}: {latency.p50_ms / 1e3:.3g} s a query, timed only ({latency.rounds} rounds)"
-        for dataset, here in (timed or {}).items()
-        for name, latency in here.items()
-        if name not in scored
-    ]
-    return "\n\n".join(pages) + "\n"
+def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
+    """All blocks as one page."""
+    return "\n\n".join(_page(block, ours) for block in blocks) + "\n"
 
 
 def _page(block: pd.DataFrame, ours: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +17,7 @@ from gsparc.data.files import load_yaml
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.summary import SUMMARY, read_summary, write_samples
 from gsparc.models.parts import leaves
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
@@ -124,7 +123,7 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     for path in map(Path, paths):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
-        own = path / "summary.json"
+        own = path / SUMMARY
         files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
         every = {file.parent.resolve(): _facts(file) for file in files}
         here = [folder for folder, facts in every.items() if _is_run(facts)]
@@ -162,12 +161,9 @@ def _is_run(facts: Mapping[str, Any]) -> bool:
 
 
 def _facts(file: Path) -> dict[str, Any]:
-    try:
-        facts = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: cannot be read as a summary ({error})") from None
-    if not isinstance(facts, dict):
-        raise ValueError(f"{file}: holds no facts by name")
+    facts = read_summary(file)
+    if facts is None:
+        raise ValueError(f"{file}: cannot be read as a summary, facts by name in JSON")
     return facts
 
 
@@ -178,7 +174,7 @@ def read_run(folder: Path) -> Run:
         ValueError: its files are of two runs.
     """
     render = columns(folder / "render_ms.csv").get("render_ms")
-    facts, samples = _facts(folder / "summary.json"), columns(folder / "per_sample.csv")
+    facts, samples = _facts(folder / SUMMARY), columns(folder / "per_sample.csv")
     runs = {facts.get("run_id"), *samples.pop("run_id", np.zeros(0))[:1].tolist()}
     runs |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
     if len(runs) > 1:

@@ -16,13 +16,13 @@ from rich.table import Table as Shown
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
+from gsparc.evaluation.experiment.done import FAILURE
 
 if TYPE_CHECKING:  # every training imports this module; pandas takes half a second
     from gsparc.evaluation.report.table import Column, Table
 
 log = logging.getLogger(__name__)
 
-FAILURE = "failure.txt"
 WIDE = ("SSIM (uniform 7)", "MSE", "p95")  # left to the files
 
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
+from gsparc.field.losses import task_loss
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
@@ -33,7 +34,6 @@ from gsparc.models.peers.gaussians import (
 )
 from gsparc.models.peers.trained import Scene
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
-from gsparc.training.losses import task_loss
 
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 

@@ -15,15 +15,15 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.field.fit import run_stage, steps_asked_for
+from gsparc.field.losses import task_loss
+from gsparc.field.module import NetworkModule
+from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.method import Method, Prediction
 from gsparc.models.parts import Origin
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.fit import run_stage, steps_asked_for
-from gsparc.training.losses import task_loss
-from gsparc.training.module import NetworkModule
-from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 DEFAULT_BUDGET_S = 60.0
@@ -113,7 +113,7 @@ class TrainedPeer(Method):
     resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
-    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare/cells)
+    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str

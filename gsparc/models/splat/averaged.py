@@ -15,6 +15,7 @@ from gsparc.data.limits import check_arguments, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import solutions
@@ -25,7 +26,6 @@ from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import no_array
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.module import GaussianModule
 
 log = logging.getLogger(__name__)
 

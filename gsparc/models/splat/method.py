@@ -25,10 +25,14 @@ from gsparc.field import edit
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel, fit_errors
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
+from gsparc.field.fit import run_stage, steps_asked_for
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
+from gsparc.field.keep_best import KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.module import GaussianModule, LossSettings, squared_error
+from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.in_double import in_double
@@ -42,10 +46,6 @@ from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.models.splat.closed_form import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.fit import run_stage, steps_asked_for
-from gsparc.training.keep_best import KeepBest, StopAt
-from gsparc.training.module import GaussianModule, LossSettings, squared_error
-from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)

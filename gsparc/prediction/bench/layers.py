@@ -7,15 +7,15 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from gsparc.field.emission import Emission, EmissionSettings
+from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import GaussianModel
+from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Pose, mean_weights
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
 from gsparc.ops.projection import Projection
 from gsparc.prediction.bench.measure import Call, Case, Work, size
 from gsparc.prediction.bench.scene import GRID, NETWORK, PAPER, Scene, places, receiver, receivers, scene
-from gsparc.training.losses import spectrum_loss
-from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
 MANY = (64, 26)  # antennas and subcarriers of the Argos release: 1,664 channels

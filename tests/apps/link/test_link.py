@@ -113,7 +113,7 @@ def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
     """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
     none = np.zeros(2)
     rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
-    facts = rate_facts({"expected": [rates]}, np.array([True, False]), np.array([0.2, 0.4]))
+    facts = rate_facts({"expected": [rates]}, np.array([True, False]))
     assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
     assert all(value is None or np.isfinite(value) for value in facts.values())
 

@@ -11,6 +11,7 @@ from gsparc.commands.train import train
 from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.places import compare_places, facts_and_table
+from gsparc.evaluation.summary import write_summary
 
 SETTINGS = {"fingerprints": {}, "splits": [], "against": ["nearest"], "calibrate": 0, "rows": 4}
 
@@ -22,7 +23,6 @@ def filled(tmp_path_factory):
     for model in ("gp", "idw"):
         chosen = f"model={model}", "baselines=[]", "logger=none"
         train(compose("dataset=own", f"dataset.file='{file}'", *chosen), folder / model)
-        (folder / model / "model.ckpt").rename(folder / model / "fold0.ckpt")
     cells = [Filled(Cell("own", "random", model, None, None), folder / model, {}) for model in ("gp", "idw")]
     return [*cells, Filled(Cell("own", "random", "gone", None, None), folder / "gone", {})]
 
@@ -54,7 +54,8 @@ def test_fingerprints_are_split_as_is_said(tmp_path):
     def located(config, folder):
         splits.append((config.dataset.name, config.dataset.split, config.dataset.file))
         figures = {"median_m": 1.0, "p90_m": 2.0, "coverage": 0.9}
-        return {f"locate/{name}": value for name, value in figures.items()} | {"time/locate_ms_p50": 3.0}
+        facts = {f"locate/{name}": value for name, value in figures.items()} | {"time/locate_ms_p50": 3.0}
+        write_summary(folder / "summary.json", facts)
 
     chosen = {"fingerprints": {"lib": str(file)}, "splits": ["random", "blocks"]}
     found = compared([], tmp_path, located, **chosen)

@@ -1,16 +1,15 @@
-"""Which cells there are, in which order, and when a kept one is still the same."""
+"""Which cells there are, and in which order."""
 
 from __future__ import annotations
 
-import sys
+from types import SimpleNamespace
 
 import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-import gsparc.models.peers
-from gsparc.evaluation.experiment.cells import Budget, Contender, code_version, key, plan
-from gsparc.evaluation.experiment.problem import Problem, SplitChoice, named
+from gsparc.evaluation.experiment.cells import Budget, Contender, plan
+from gsparc.evaluation.experiment.problem import SplitChoice, named
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -21,8 +20,9 @@ METHODS = {
 BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
 
 
-def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> Problem:
-    return Problem(dataset, split, kind, ("", ""), **others)
+def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
+    own = {"draw": None, "stations": False, "scene": False}
+    return SimpleNamespace(dataset=dataset, split=split, kind=kind, **(own | others))
 
 
 def names(*only: str, kind: str = "spectrum") -> list[str]:
@@ -97,37 +97,3 @@ def test_every_method_of_the_default_comparison_composes():
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
         named(group, of, {"x": entry})
-
-
-MODULE = '''"""{doc}"""
-from gsparc.models.baselines.mean import Mean
-
-
-class Toy(Mean):
-    """{doc}"""
-    VALUE = {value}
-'''
-
-
-def test_words_do_not_make_another_method_and_numbers_do(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsparc.models.peers.__path__", [*gsparc.models.peers.__path__, str(tmp_path)])
-    versions = []
-    for doc, value in (("One.", 1), ("Other words.  # and a comment", 1), ("One.", 2)):
-        (tmp_path / "toy.py").write_text(MODULE.format(doc=doc, value=value))
-        monkeypatch.delitem(sys.modules, "gsparc.models.peers.toy", raising=False)
-        versions.append(code_version({"_target_": "gsparc.models.peers.toy.Toy"}))
-    assert versions[0] == versions[1] != versions[2]
-    assert code_version({"_target_": "gsparc.models.peers.gsrf.GSRF"}) != code_version(
-        {"_target_": "gsparc.models.baselines.mean.Mean"}
-    )
-
-
-def test_a_key_names_data_split_and_settings():
-    model = {"_target_": "gsparc.models.baselines.mean.Mean"}
-    base = key(model, {}, "data", "split")
-    assert base == key(dict(model), {}, "data", "split")
-    others = [
-        key(model, {}, "data2", "split"), key(model, {}, "data", "split2"),
-        key({**model, "x": 1}, {}, "data", "split"), key(model, {"max_steps": 1}, "data", "split"),
-    ]  # fmt: skip
-    assert len({base, *others}) == 5

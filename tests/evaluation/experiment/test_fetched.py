@@ -20,12 +20,12 @@ def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     settings = plain(compose("experiment=results/newrf", config="compare"))
     with pytest.raises(ValueError, match="no dataset has a path"):
-        problems_of(settings, tmp_path / "cells")
+        problems_of(settings)
     (tmp_path / "gsparc/data/newrf").mkdir(parents=True)
     shutil.copy(real(f"releases/newrf/{ROOM}"), tmp_path / "gsparc/data/newrf")
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        problems = problems_of(settings, tmp_path / "cells")
+        problems = problems_of(settings)
     assert [one.split for one in problems] == ["redrawn"] * 5
     assert {one.draw for one in problems} == set(range(5)) and len(problems[0].data) == 433
     assert "or gsparc data" in caplog.text  # of the other sets

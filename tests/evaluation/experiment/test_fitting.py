@@ -8,74 +8,29 @@ import json
 import pytest
 from hydra import initialize_config_module
 
-from gsparc.evaluation.experiment import fitting
 from gsparc.evaluation.experiment.cells import Cell, Contender
-from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
+from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
 from gsparc.evaluation.experiment.latency import timed_here
-from gsparc.evaluation.experiment.problem import (
-    Problem,
-    SplitChoice,
-    _may_match,
-    stored_problems,
-)
+from gsparc.evaluation.experiment.problem import Problem, _may_match
 from gsparc.models.checkpoint import CheckpointError
 
 
-def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
-    """Results travel as text, models do not: their timings must not be replaced by those of a few."""
+@pytest.fixture
+def problem(campaign, folds):
+    return Problem("own", "random", ("dataset=own", "split=random"), campaign("spectrum", 20), folds(20), "d")
+
+
+def test_kept_timings_stand_where_nothing_is_timed(tmp_path):
     kept = {"gp": {"p50_ms": 1.5, "p95_ms": 2.0, "to_copy": 0.5, "rounds": 60}}
     (tmp_path / "latency-toy.json").write_text(json.dumps(kept))
     cells = [Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})]
-    assert timed_here(cells, {}, tmp_path, measure=True)["toy"]["gp"].p50_ms == 1.5
-    assert "models of gp are not here" in caplog.text
+    for measure in (False, True):  # of whose models none is here
+        assert timed_here(cells, {}, tmp_path, measure)["toy"]["gp"].p50_ms == 1.5
     assert timed_here(cells, {}, tmp_path / "none", measure=True) == {"toy": {}}
 
 
-def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
-    """Published cells would vanish from the table with every edit of a method."""
-    cell = Cell("toy", "random", "gp", None, None)
-    problem = Problem("toy", "random", "spectrum", ("d", "s", "i"))
-    prepared = Prepared(cell, problem, None, tmp_path / "toy-random-gp-today")
-    facts = {
-        "seed": None, "budget_s": None, "git": "0123456789",
-        "dataset/kind": "spectrum", "dataset/sha256": "d", "split/sha256": "s",
-    }  # fmt: skip
-
-    def write(name: str, **changes: str) -> None:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
-
-    write("toy-random-gp-other", **{"dataset/sha256": "e"})
-    write("toy-random-gp-grid", **{"dataset/identity": "of another grid"})
-    write("toy-random-gp-cut")
-    (tmp_path / "toy-random-gp-cut" / "cell.json").write_text("{")
-    assert prepared.result() is None and prepared.old_result() is None
-    write("toy-random-gp-old", made="2026-01-01")
-    write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
-    found = prepared.old_result()
-    assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
-    write("toy-random-gp-today")
-    assert prepared.result().earlier is None
-    random, sparse = SplitChoice("random"), SplitChoice("sparse")
-    for name in ("old", "newer", "today"):
-        kept = {**facts, "dataset/identity": "i"}
-        (tmp_path / f"toy-random-gp-{name}" / "cell.json").write_text(json.dumps(kept))
-    assert stored_problems(tmp_path, "toy", [random, sparse]) == [problem]
-    assert not stored_problems(tmp_path, "t", [random])
-
-
-def test_kept_results_of_draws_are_a_problem_each(tmp_path):
-    for draw, folds in enumerate(("s0", "s1")):
-        facts = {"seed": draw, "dataset/kind": "rssi", "dataset/sha256": "d", "split/sha256": folds}
-        (tmp_path / f"toy-drawn-gp-{draw}").mkdir()
-        (tmp_path / f"toy-drawn-gp-{draw}" / "cell.json").write_text(json.dumps(facts))
-    found = stored_problems(tmp_path, "toy", [SplitChoice("drawn", draws=3)])
-    assert [(p.draw, p.hashes[1]) for p in found] == [(0, "s0"), (1, "s1")]
-
-
-def prepared(folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose=()):
+def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose=()):
     """A cell as it is before it is filled."""
-    problem = Problem("own", "random", "spectrum", ("d", "s", "i"))
     contender = Contender(model, (f"model={model}", *choose), ("budget_s={budget_s}",))
     cell = Cell("own", "random", model, budget_s, seed)
     with initialize_config_module("gsparc.conf", version_base="1.3"):
@@ -97,33 +52,32 @@ def prepared(folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose
         [{}, {"choose": ("init_from=model.ckpt",)}],
     ],
 )
-def test_a_cell_was_taken_for_one_of_another_batch_clock_or_start(changes, tmp_path):
-    found = [prepared(tmp_path, **change) for change in changes]
-    assert len({one.folder for one in found}) == len(changes) and found[0].config.budget_s == 5
+def test_a_cell_was_taken_for_one_of_another_batch_clock_or_start(changes, tmp_path, problem):
+    found = [prepared(problem, tmp_path, **change) for change in changes]
+    states = [one.state for one in found]
+    assert all(one not in states[:number] for number, one in enumerate(states))
+    assert found[0].config.budget_s == 5
 
 
-def test_a_cell_was_taken_for_one_of_other_walls_in_a_file_of_that_name(tmp_path):
-    walls, folders = tmp_path / "walls.json", set()
-    for text in ("[]", "[1]"):
-        walls.write_text(text)
-        folders.add(prepared(tmp_path, choose=("init=scene", f"init.file={walls}")).folder)
-    assert len(folders) == 2
+def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
+    """Published results outlive the program they were measured with: a table says so."""
+    one = prepared(problem, tmp_path, "mean")
+    facts = {"program": one.state.program, "git": "0123456789"}
+    assert one.filled(facts).earlier == "" and one.filled({**facts, "program": "q"}).earlier == "01234567"
+    assert one.folder == tmp_path / "own" / "random" / "mean" / "5" / "0" and one.result() is None
 
 
-def test_a_full_disk_ends_a_comparison(campaign, folds, tmp_path, monkeypatch):
+def test_a_full_disk_ends_a_comparison(problem, tmp_path):
     """Every further cell was trained in vain; then `no cell is filled (train=true fills them)`."""
     tried = []
 
-    def full(prepared):
-        tried.append(prepared)
+    def full(one, left):
+        tried.append(one)
         raise CheckpointError("m.ckpt: cannot be written") from OSError(errno.ENOSPC, "No space left")
 
-    monkeypatch.setattr(fitting, "fill", full)
-    data = campaign("spectrum", 20)
-    problem = Problem("toy", "random", "spectrum", ("d", "s", "i"), data=data, folds=folds(20))
-    cells = [Cell("toy", "random", method, None, None) for method in ("mean", "gp")]
+    cells = [prepared(problem, tmp_path, method) for method in ("mean", "gp")]
     with pytest.raises(CheckpointError, match="cannot be written"):
-        fill_all([Prepared(one, problem, None, tmp_path / one.method) for one in cells])
+        fill_all(cells, full)
     assert len(tried) == 1
 
 

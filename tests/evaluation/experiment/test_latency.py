@@ -42,7 +42,7 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     monkeypatch.setattr(latency, "SLOW_MS", 150.0)
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
     monkeypatch.setattr(latency, "FAST", replace(latency.FAST, rounds=12))
-    problem = Problem("toy", "random", "spectrum", ("", ""), data=campaign("spectrum", 20), folds=folds(20))
+    problem = Problem("toy", "random", (), campaign("spectrum", 20), folds(20))
     cells = [Filled(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
     found = latency.latencies(cells, problem)
     assert list(found) == list(WAITS)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from clocks import WoundClock
 from invented import divide, invent
 
 from gsparc.data.query import Batch
+from gsparc.evaluation.experiment import study
+from gsparc.evaluation.experiment.done import State
 from gsparc.evaluation.experiment.fit import fit_folds, in_folders
 from gsparc.evaluation.experiment.study import Measured, Positions, Study, facts_of
 from gsparc.models.baselines.gp import GaussianProcess
@@ -19,9 +19,21 @@ from gsparc.prediction import timing
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext, FitReport
 
-CONTEXT = FitContext(Path("not-written"), seed=5, budget_s=7.0)
+STATE = State({}, {}, "", "", "")
 CLOCK = ClockSettings(rounds=10, budget_s=2)
 WATCH = WoundClock()
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    """Run a study in a folder; models are kept in memory, of classes that no file may name."""
+    kept = {}
+    monkeypatch.setattr(
+        study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
+    )
+    monkeypatch.setattr(study.loading, "load", lambda path: (kept[path], None))
+    context = FitContext(tmp_path, seed=5, budget_s=7.0)
+    return lambda of, data, split: of.run(data, split, context, STATE)
 
 
 class Slow(Nearest):
@@ -56,10 +68,10 @@ class NeedsUplink(Quick):
         return super().predict(query)
 
 
-def test_times_are_ratios_to_the_base(monkeypatch):
+def test_times_are_ratios_to_the_base(monkeypatch, run):
     monkeypatch.setattr(timing.time, "perf_counter", WATCH)
     made = dict(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
-    rows = Study(made, base="plain", rounds=2, clock=CLOCK).run(invent("csi"), divide(48), CONTEXT)
+    rows = run(Study(made, base="plain", rounds=2, clock=CLOCK), invent("csi"), divide(48))
     found = {row.variant: row for row in rows.itertuples()}
     assert list(found) == ["plain", "slow", "needs"]
     assert found["plain"].query_ratio == found["plain"].train_ratio == 1
@@ -71,30 +83,31 @@ def test_times_are_ratios_to_the_base(monkeypatch):
     assert facts["study/slow/train_s"] == 3 and {"study/slow/nmse", "study/slow/query_ms"} <= set(facts)
 
 
-def test_the_base_must_be_there():
+def test_the_base_must_be_there(run):
     with pytest.raises(ValueError, match="no such variant; there are mean"):
         Study(dict(mean=Mean), base="plain")
     for base in ("plain", None):
         with pytest.raises(ValueError, match="not possible"):
-            Study(dict(plain=Impossible), base=base).run(invent("csi"), divide(48), CONTEXT)
+            run(Study(dict(plain=Impossible), base=base), invent("csi"), divide(48))
 
 
-def test_every_fit_gets_the_context_and_every_round_another_seed():
+def test_every_fit_gets_the_context_and_every_round_another_seed_once(run):
     found = []
 
     def make():
         found.append(Quick())
         return found[-1]
 
-    Study(dict(quick=make), rounds=2, seed=3, clock=CLOCK).run(invent(), divide(48, 2), CONTEXT)
+    for _ in range(2):  # the second time every round is done
+        run(Study(dict(quick=make), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
     assert [m.context.seed for m in found] == [3, 3, 4, 4] and {m.context.budget_s for m in found} == {7.0}
     assert len({m.context.run_dir for m in found}) == 4
 
 
-def test_errors_cost_an_interpolator_and_not_the_mean():
+def test_errors_cost_an_interpolator_and_not_the_mean(run):
     data, split = invent(), divide(48)
     conditions = Positions([0.001, 0.3]).conditions()
-    rows = Study(dict(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK).run(data, split, CONTEXT)
+    rows = run(Study(dict(gp=GaussianProcess, mean=Mean), conditions, clock=CLOCK), data, split)
     value = {(r.variant, r.what, r.amount): r.value for r in rows.itertuples()}
     assert len(value) == 14
     for what in ("query", "train"):
@@ -104,9 +117,9 @@ def test_errors_cost_an_interpolator_and_not_the_mean():
     assert (clean.train_s, clean.query_ms) == (asked.train_s, asked.query_ms)  # trained and timed once
 
 
-def test_more_measurements_are_better_and_are_counted():
+def test_more_measurements_are_better_and_are_counted(run):
     conditions = Measured([1, 0.5, 9]).conditions()
-    rows = Study(dict(gp=GaussianProcess), conditions, clock=CLOCK).run(invent(), divide(48), CONTEXT)
+    rows = run(Study(dict(gp=GaussianProcess), conditions, clock=CLOCK), invent(), divide(48))
     assert list(rows.rows) == [36, 18, 9]
     values = list(rows.value)
     assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1
@@ -115,10 +128,12 @@ def test_more_measurements_are_better_and_are_counted():
         Measured([0.0])
 
 
-def test_folds_are_pooled_and_each_fit_is_handed_on():
+def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
     data, split = invent("csi"), divide(48, 3)
     kept = []
-    fits = fit_folds(Nearest, data, split, in_folders(CONTEXT, split), keep=lambda *given: kept.append(given))
+    fits = fit_folds(
+        Nearest, data, split, in_folders(FitContext(tmp_path), split), keep=lambda *given: kept.append(given)
+    )
     assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
     found = fits.scored_on(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3

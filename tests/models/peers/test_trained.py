@@ -19,13 +19,13 @@ from scenes import lobes, room
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.evaluation.experiment.fit import callbacks_of
+from gsparc.field.fit import DEFAULTS
+from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import HasGaussians
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
-from gsparc.training.fit import DEFAULTS
-from gsparc.training.optimizer import rate_factor
 
 SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 CHANNELS = ("gsrf", "ngrf", "newrf")
@@ -90,7 +90,7 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
         seen.append((step, total, rate_factor(kind, settings, step, total)))
         return seen[-1][2]
 
-    monkeypatch.setattr("gsparc.training.optimizer.rate_factor", noted)
+    monkeypatch.setattr("gsparc.field.optimizer.rate_factor", noted)
     for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 0)):
         method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
         build = method.build

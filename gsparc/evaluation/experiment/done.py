@@ -1,0 +1,223 @@
+"""When a cell is done: its folder holds a summary of the same settings, files, data, split and program."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from hashlib import file_digest, sha256
+from importlib.metadata import distribution, packages_distributions
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.assemble import content_hash, identity
+from gsparc.data.errors import DataError
+from gsparc.data.files import set_aside, whole_file
+from gsparc.data.instantiate import targets
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.summary import SUMMARY, read_summary
+from gsparc.models.parts import LAST, leaves
+
+log = logging.getLogger(__name__)
+
+RECORD = "job.json"  # in a cell's folder: its state, when it began, and whether it has ended
+FAILURE = "failure.txt"  # why it has failed
+WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a cell is done
+OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
+PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
+NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
+LIBRARIES = {"lightning", "torch"}  # named by every configuration; their versions stand in each summary
+
+
+@dataclass(frozen=True)
+class State:
+    """What a result depends on.
+
+    Attributes:
+        settings: resolved, by dotted name.
+        files: SHA-256 of the files that settings name, by these; those of the data are in `data`.
+        data: SHA-256 of the measurements, whatever files they were read from; "" without any.
+        split: SHA-256 of the folds.
+        program: see `program`.
+    """
+
+    settings: dict[str, Any]
+    files: dict[str, str]
+    data: str
+    split: str
+    program: str
+
+    @classmethod
+    def of(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+        """Return the state of a resolved configuration on data (`content`) under a split (its hash)."""
+        kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
+        whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
+        named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
+        files = {name: value for name, value in named.items() if isinstance(value, str)}
+        found = {name: _content_of(value) for name, value in files.items() if os.path.isfile(value)}
+        return cls(json.loads(json.dumps(named, default=str)), found, data, split, program(whole))
+
+    def same(self, record: Mapping[str, Any], reuse: bool = False) -> bool:
+        """Whether a record is of this state; `reuse`: whatever the program was."""
+        names = set(asdict(self)) - ({"program"} if reuse else set())
+        return all(record.get(name) == getattr(self, name) for name in names)
+
+
+def content(data: Measurements) -> str:
+    """Return the SHA-256 of all that a method can learn from, of every file that was read."""
+    arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
+    arrays |= {f"release {i}": rows for i, rows in enumerate(data.release_split or ())}
+    whole = (identity(data), content_hash(arrays), data.provenance.get("scene"))
+    return sha256(repr(whole).encode()).hexdigest()
+
+
+def finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+    """Return the summary of a cell that is done; None where it is not.
+
+    Args:
+        folder: of the cell.
+        state: of what is asked for.
+        reuse: whether a result of another program counts, too; its `program` and `git` say of which.
+    """
+    record = read_summary(folder / RECORD)
+    ended = record is not None and record.get("ended") and state.same(record, reuse)
+    return read_summary(folder / SUMMARY) if ended else None
+
+
+def once(
+    folder: Path,
+    state: State,
+    work: Callable[[str | None], object],
+    *,
+    reuse: bool = False,
+    again: bool = False,
+) -> dict[str, Any]:
+    """Return the summary of a cell, which is done now where it is not done.
+
+    Args:
+        folder: the cell's own, held by the caller.
+        state: of the cell.
+        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
+            interrupted try has left, None to begin anew.
+        reuse: see `finished`.
+        again: one that is done is done anew.
+
+    Raises:
+        DataError: the work has left no summary.
+    """
+    facts = None if again else finished(folder, state, reuse)
+    if facts is not None:
+        log.info("%s: was done before", folder)
+        return facts
+    record = read_summary(folder / RECORD)
+    left = None
+    if record is None or record.get("ended") or not state.same(record):
+        set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
+        record = {**asdict(state), "began": time.time(), "ended": False}
+        _write(folder / RECORD, record)
+    else:
+        left = _last_state(folder, record["began"])
+    (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
+    work(left)
+    _write(folder / RECORD, {**record, "ended": True})
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
+
+
+def program(settings: Any) -> str:
+    """Return the hash of the text of gsparc and of every other package that settings name classes of."""
+    named = {str(path).partition(".")[0] for path in targets(settings)}
+    return _program(tuple(sorted({"gsparc", *named} - LIBRARIES)))
+
+
+@functools.cache  # of a process, which runs what it has read
+def _program(packages: tuple[str, ...]) -> str:
+    digest = sha256()
+    for package in packages:
+        digest.update(f"{package} {text_of(package)};".encode())
+    return digest.hexdigest()[:12]
+
+
+def text_of(package: str) -> str:
+    """Return the hash of a package's text.
+
+    In a checkout it is of what git tracks and of new files, as they are: commits that change pages or tests
+    alone change nothing. Of an installed distribution it is of its record, else of all modules in its folder.
+    """
+    spec = find_spec(package)
+    if spec is None:
+        return ""
+    inside = next(iter(spec.submodule_search_locations or ()), None)
+    if inside is None:  # one module
+        return "" if spec.origin is None else _content_of(spec.origin)
+    folder = Path(spec.origin).parent if spec.origin else Path(inside)
+    checkout = _checkout(folder)
+    if checkout is not None:
+        return _of_files(*checkout)
+    for name in packages_distributions().get(package, ()):
+        one = distribution(name)  # the record of an editable one names no module
+        if any(file.parts[0] == package for file in one.files or ()):
+            return sha256(str(one.read_text("RECORD")).encode()).hexdigest()
+    return _of_files(folder, [str(file.relative_to(folder)) for file in folder.rglob("*.py")])
+
+
+def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
+    """The root of the working tree that a package is tracked in, and its program's files; None: in none."""
+
+    def ask(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        try:
+            return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout
+        except (OSError, subprocess.SubprocessError):
+            return ""
+
+    root = ask("rev-parse", "--show-toplevel").strip()
+    if not root or not ask("ls-files"):
+        return None
+    files = ask("-C", root, "ls-files", "-z", "--cached", "--others", "--exclude-standard").split("\0")
+    texts = [one for one in files if one.endswith(PROGRAM)]
+    own = str(folder.relative_to(root))  # of a plugin among the examples, too
+    return Path(root), [one for one in texts if not one.startswith(NO_PROGRAM) or one.startswith(own)]
+
+
+def _of_files(root: Path, files: Iterable[str]) -> str:
+    digest = sha256()
+    for name in sorted(set(files)):
+        if (root / name).is_file():  # git lists what was removed until it is committed
+            digest.update(f"{name} {_content_of(root / name)};".encode())
+    return digest.hexdigest()
+
+
+def _content_of(file: str | Path) -> str:
+    with open(file, "rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
+
+
+def _last_state(folder: Path, began: float) -> str | None:
+    """The last checkpoint of this cell, not of one of another state before, or the folder of one of many
+    parts; None: it begins anew."""
+
+    def own(path: Path) -> bool:
+        return path.exists() and path.stat().st_mtime >= began
+
+    for name in LAST:
+        if own(folder / name):
+            return str(folder / name)
+    return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
+
+
+def _write(path: Path, record: Mapping[str, Any]) -> None:
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(record, indent=1), encoding="utf-8")

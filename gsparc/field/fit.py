@@ -1,0 +1,285 @@
+"""One stage of gradient training under Lightning."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from lightning.pytorch.plugins.io import CheckpointIO
+from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
+
+from gsparc.data import heeded
+from gsparc.data.datamodule import Loaded
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.field.module import NetworkModule
+from gsparc.field.pace import SPENT, Budget
+from gsparc.field.processes import Processes
+from gsparc.training.context import FitContext
+from gsparc.training.time_budget import Spent, TimeBudget
+
+log = logging.getLogger(__name__)
+
+TAKEN = "steps/taken"
+KEPT = "steps/kept"
+LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
+LOOKS = 10  # validations of a training, where the Trainer is given no interval
+
+# What conf/trainer/cpu.yaml says, for callers from Python.
+DEFAULTS = partial(
+    L.Trainer,
+    accelerator="cpu",
+    devices=1,
+    strategy="auto",
+    precision="32-true",
+    enable_progress_bar=False,
+    enable_model_summary=False,
+)
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a stage took.
+
+    Attributes:
+        seconds: that it took, validations too [s].
+        kept: steps whose result is kept; None where the schedule was gone through to its end.
+        taken: steps in all.
+        timed_out: whether `trainer.max_time` ended it.
+    """
+
+    seconds: float
+    kept: int | None
+    taken: int
+    timed_out: bool = False
+
+
+def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> int | None:
+    """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
+
+    Args:
+        context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
+        rows: that are learned from, for epochs.
+        own: as the model is configured.
+
+    Raises:
+        ValueError: the Trainer is given what is no number of steps.
+    """
+    options = (context.trainer or DEFAULTS).keywords
+    steps, epochs = (None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs"))
+    for name, value in (("max_steps", steps), ("max_epochs", epochs)):
+        if value is not None and (type(value) is not int or value < 0):
+            raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
+    if own == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
+        heeded.count("model.steps")
+        return own
+    heeded.count("trainer.max_steps", "trainer.max_epochs")
+    size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
+    of_epochs = None if epochs is None else epochs * -(-rows // size)
+    return min(one for one in (steps, of_epochs) if one is not None)
+
+
+class ReturnMetrics(L.Callback):
+    """Steps of training as a metric: of all attributes, only these leave a process."""
+
+    def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
+        """Also after a checkpoint with every step done; of an unfinished schedule, what was taken is kept."""
+        trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
+        if trainer.global_step < module.total_steps:
+            trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
+
+
+def stands(trainer: L.Trainer) -> bool:
+    """Whether a step is done with, at the end of its batch or of its look at validation rows.
+
+    Lightning leaves out a look that follows, where a run goes on from a state before it.
+    """
+    if trainer.validating:
+        return trainer.state.fn == "fit"
+    every = trainer.val_check_batch
+    due = isinstance(every, int) and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+    return trainer.training and not (due and trainer.enable_validation)
+
+
+class _Stopped(BaseException):
+    """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
+
+
+class StopBetweenSteps(L.callbacks.Checkpoint):
+    """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
+
+    The last step leaves one, too.
+
+    In several processes it does not wait, nor does a second one: the checkpoint before is what is left.
+
+    Args:
+        file: the checkpoint written when stopped.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.requested = file, False
+
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        """Every process that trains is as quiet as the first."""
+        _quieten_lightning()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Write the checkpoint and end training when asked to."""
+        if self.requested and stands(trainer):
+            trainer.save_checkpoint(self.file)
+            raise _Stopped
+
+    on_validation_end = on_train_batch_end  # type: ignore[assignment]
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Leave the state after the last step."""
+        trainer.save_checkpoint(self.file)
+
+    @contextmanager
+    def handling_interrupts(self) -> Iterator[None]:
+        """Take interrupts while training runs; outside the main thread there are none to take."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupted(signum: int, frame: Any) -> None:
+            if self.requested:
+                raise KeyboardInterrupt
+            self.requested = True
+
+        before = signal.signal(signal.SIGINT, interrupted)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
+def run_stage(
+    module: NetworkModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
+    budget: TimeBudget, watch: Sequence[L.Callback] = (),
+) -> Ran:  # fmt: skip
+    """Train `module` on `fold.train`, watching `fold.val`.
+
+    Args:
+        module: what is trained.
+        data, fold, context: of the fit.
+        checkpoints: how `last.ckpt` is written.
+        budget: of the fit, running.
+        watch: callbacks that say which steps are kept.
+
+    Raises:
+        KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
+    """
+    folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
+    before = budget.counted
+    budget.pause()
+    budget.go()  # what other processes go on from
+    if batches is None or batches.measurements is not data:
+        batches = Loaded(data, context.batch_size)
+    batches.use(fold, context.seed)
+    _quieten_lightning()
+    stop = StopBetweenSteps(folder / "last.ckpt")
+    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), module.count is not None)]
+    for callback in callbacks:
+        if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
+            callback.dirpath = str(folder)
+    given = make.keywords.get("val_check_interval")
+    every = given if type(given) is int else max(1, module.total_steps // LOOKS)
+    # A validation sees the figures of its own step.
+    module.log_every = math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
+    per_epoch = max(1, len(fold.train) // batches.batch_size)
+    options: dict[str, Any] = {
+        "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
+        "check_val_every_n_epoch": None,  # validations are counted in steps
+        "val_check_interval": every if given is None else given,
+        "num_sanity_val_steps": -1,  # all validation rows, before the first step: where the curve begins
+    }
+    if not len(fold.val):
+        options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
+    options["max_steps"] = module.total_steps
+    options["max_epochs"] = -1
+    heeded.count("trainer", "callbacks")
+    processes = Processes.named(make.keywords.get("strategy"))
+    if module.count is None:  # networks of published methods make tensors of their own, on the CPU
+        if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
+            log.warning("published methods train in one process on the CPU, whatever trainer= says")
+        processes, options = None, {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"}
+    if processes is not None:
+        options["strategy"] = processes
+    trainer = make(
+        callbacks=[*callbacks, ReturnMetrics(), stop],
+        logger=list(context.loggers) or False,
+        plugins=[checkpoints],
+        default_root_dir=folder,
+        **options,
+    )
+    if processes is not None:  # which note nothing here
+        heeded.count("*")
+    if trainer.world_size > 1 and processes is None:
+        raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
+    try:
+        with stop.handling_interrupts():
+            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
+    except (_Stopped, SystemExit, ProcessException) as ended:
+        # Lightning's answer to a KeyboardInterrupt is SystemExit.
+        advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
+        if isinstance(ended, ProcessException) and not stop.requested:
+            raise RuntimeError(_lost(ended, advice)) from ended
+        raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
+    finally:
+        batches.trainer = None  # which holds the optimizer's state
+    metrics = trainer.callback_metrics
+    more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
+    budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
+    kept = int(metrics[KEPT]) if KEPT in metrics else None
+    taken = int(metrics[TAKEN])
+    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[union-attr]
+    timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
+    if timed_out:
+        log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
+    return Ran((budget.counted - before).wall, kept, taken, timed_out)
+
+
+def _told(callbacks: Sequence[L.Callback], rows: int, edits: bool) -> Sequence[L.Callback]:
+    """Without those of figures of validation rows, or of Gaussians to edit, where there are none."""
+    blind = [] if rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+    if blind:
+        log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
+    return [c for c in callbacks if c not in blind and (edits or not hasattr(c, "edits_gaussians"))]
+
+
+def _lost(error: ProcessException, advice: str) -> str:
+    """What was said by the process that failed, without its traceback; or which one was killed."""
+    if isinstance(error, ProcessExitedException):
+        how = error.signal_name or f"exit status {error.exit_code}"
+        return f"training process {error.error_index} ended by {how}, the others were stopped; {advice}"
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1].partition("Error: ")[2] or lines[-1] if lines else type(error).__name__
+
+
+def _quieten_lightning() -> None:
+    """Lightning advertises and repeats what the progress line says; its warnings stay, but for a few."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # its report was asked for
+    logging.getLogger("torch.multiprocessing.spawn").setLevel(logging.ERROR)  # our error says it in one line
+    for pointless in (
+        r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
+        r".*does not have many workers.*",  # data this small is faster without
+        r".*callbacks used to create the checkpoint need to be provided.*",  # schedules may change
+        r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
+        r".*recommended to use `self.log\(.*sync_dist=True.*",  # every device validates all rows
+        r".*smaller than the logging interval.*",  # small campaigns have few batches
+        r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
+    ):
+        warnings.filterwarnings("ignore", pointless)

@@ -1,0 +1,97 @@
+"""Steps that pay: of all looks at validation rows, from before the first step on, the best is kept."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from gsparc.field import edit
+from gsparc.field.fit import KEPT
+from gsparc.field.module import GaussianModule
+from gsparc.field.processes import agreed
+
+log = logging.getLogger(__name__)
+
+SURE = 2.0  # standard errors of paired rows by which a look must be better than the start
+
+
+class KeepBest(L.Callback):
+    """Restores the parameters of the best look when training ends; it does not end training.
+
+    A look is kept where the error of its rows is below that of the same rows before the first step by two
+    standard errors, and below that of all looks before it.
+
+    Attributes:
+        step: of the kept parameters; 0: as they were before the first.
+    """
+
+    def __init__(self) -> None:
+        self.error = float("inf")
+        self.step = 0
+        self.start = torch.zeros(0)  # errors of the rows before the first step (n,)
+        self._kept: dict[str, Any] | None = None
+
+    def on_validation_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
+        """Keep what is better; the look before the first step is Lightning's sanity check."""
+        if trainer.state.fn != "fit" or not len(module.held_out):
+            return
+        error = agreed(float(module.held_out.mean()), trainer)
+        if trainer.sanity_checking:
+            self.start = module.held_out
+        surely = agreed(float(_surely_less(module.held_out, self.start)), trainer)
+        if trainer.sanity_checking or (error < self.error and surely):
+            self.error, self.step = error, trainer.global_step
+            self._kept = copy.deepcopy(module.model.state_dict())
+
+    def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
+        """Back to the best; also after a checkpoint with every step done."""
+        if self._kept is None:
+            return
+        trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
+        taken = trainer.global_step
+        if self.step == taken:
+            return
+        model = module.model
+        edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
+        model.load_state_dict(self._kept)
+        log.info(
+            "gradient steps: %d taken, %s kept: what came after was not surely better on %d validation rows",
+            taken, f"the first {self.step}" if self.step else "none", len(self.start),
+        )  # fmt: skip
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is kept, so that a resumed run ends with it, too."""
+        return {"error": self.error, "step": self.step, "start": self.start, "kept": self._kept}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on."""
+        self.error, self.step = state["error"], state["step"]
+        self.start, self._kept = state["start"], state["kept"]
+
+
+def _surely_less(errors: Tensor, start: Tensor) -> bool:
+    """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of the differences."""
+    if len(errors) != len(start) or len(errors) < 2:
+        return len(errors) != len(start)  # a training without a look before its first step keeps the least
+    gain = start - errors
+    return bool(gain.mean() > SURE * gain.std() / len(gain) ** 0.5)
+
+
+class StopAt(L.Callback):
+    """Ends training where an earlier stage found that further steps do not pay.
+
+    Args:
+        step: the last one.
+    """
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: GaussianModule, *unused: Any) -> None:  # type: ignore[override]
+        """After every step."""
+        trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step

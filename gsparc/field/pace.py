@@ -1,0 +1,62 @@
+"""What the steps of a stage spend, and the seconds that end them before their schedule does."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import astuple
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+
+from gsparc.field.processes import agreed
+from gsparc.training.time_budget import NOTHING, Spent, TimeBudget
+
+SPENT = "time/spent_s"  # metric of both clocks
+
+
+class Budget(L.Callback):
+    """Counts the seconds of a stage, validations too, and ends it when they are over.
+
+    Args:
+        budget: running, with all that was spent before.
+    """
+
+    def __init__(self, budget: TimeBudget) -> None:
+        self.budget, self._begin, self._process = budget, budget.counted, os.getpid()
+        self._resumed = NOTHING
+
+    @property
+    def _learned(self) -> Spent:
+        return self.budget.counted - self._begin
+
+    def _look(self, trainer: L.Trainer) -> None:
+        if agreed(float(self.budget.over()), trainer):
+            trainer.should_stop = True
+
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        """Of several processes each has a processor time of its own."""
+        if os.getpid() != self._process:
+            self.budget.moved()
+
+    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
+        """What making the Trainer took is no part of the stage; look at the clock."""
+        self._begin = self._begin + (self._learned - self._resumed)
+        self._look(trainer)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """End when the seconds are over."""
+        self._look(trainer)
+
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Bring home what was spent; only metrics leave the process where there are several devices."""
+        trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Seconds spent, so that a resumed run has only the rest."""
+        return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._resumed = Spent(float(state["seconds"]), float(state["processor_s"]))
+        self.budget.charge(self._resumed)

@@ -1,0 +1,180 @@
+"""A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaigns import compose, spectra
+from omegaconf import OmegaConf
+
+import gsparc
+from gsparc.commands.train import begin
+from gsparc.data.splits import Fold, Split, indices_hash, write_split
+from gsparc.evaluation.experiment.done import (
+    FAILURE,
+    State,
+    _checkout,
+    content,
+    finished,
+    once,
+    text_of,
+)
+from gsparc.evaluation.summary import write_summary
+
+
+def state(**changes) -> State:
+    return State(
+        **({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s", "program": "p"} | changes)
+    )
+
+
+def ends(folder, value=1.0, seen=None):
+    """Work that ends with this value, and notes what it was given to go on from."""
+
+    def work(left):
+        if seen is not None:
+            seen.append(left)
+        write_summary(folder / "summary.json", {"value": value})
+
+    return work
+
+
+def cut_short(folder, name="last.ckpt"):
+    def work(left):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("state")
+        raise KeyboardInterrupt
+
+    return work
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"settings": {"seed": 1}},
+        {"files": {"init.file": "0"}},
+        {"data": "e"},
+        {"split": "t"},
+        {"program": "q"},
+    ],
+)
+def test_a_cell_is_done_once_in_one_state(tmp_path, other):
+    assert once(tmp_path, state(), ends(tmp_path, 1)) == once(tmp_path, state(), ends(tmp_path, 2))
+    assert finished(tmp_path, state(**other)) is None
+    assert once(tmp_path, state(**other), ends(tmp_path, 3)) == {"value": 3}
+    assert finished(tmp_path, state()) is None
+    assert once(tmp_path, state(**other), ends(tmp_path, 4), again=True) == {"value": 4}
+    (tmp_path / "summary.json").write_text("{")  # no whole one
+    assert finished(tmp_path, state(**other)) is None
+
+
+def test_another_program_s_result_counts_where_that_is_asked(tmp_path):
+    once(tmp_path, state(), ends(tmp_path, 1))
+    assert once(tmp_path, state(program="q"), ends(tmp_path, 2), reuse=True) == {"value": 1}
+    assert once(tmp_path, state(program="q"), ends(tmp_path, 2)) == {"value": 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "resumed"),
+    [("last.ckpt",) * 2, ("refit/last.ckpt",) * 2, ("fold1/last.ckpt", ""), ("station0/model.ckpt", "")],
+)
+@pytest.mark.parametrize("again", [False, True])
+def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, name, resumed, again):
+    """The same run said again began anew without a word; one that has ended is done again by itself alone."""
+    with pytest.raises(KeyboardInterrupt):
+        once(tmp_path, state(), cut_short(tmp_path, name), again=again)
+    (tmp_path / FAILURE).write_text("of the first try")
+    seen = []
+    for _ in range(2):
+        once(tmp_path, state(), ends(tmp_path, 1, seen), again=again)
+    assert seen == [str(tmp_path / resumed), *([None] * again)] and not (tmp_path / FAILURE).exists()
+
+
+def test_a_checkpoint_of_another_state_is_not_gone_on_from(tmp_path):
+    for program in "pq":
+        with pytest.raises(KeyboardInterrupt):
+            once(tmp_path, state(program=program), cut_short(tmp_path))
+    seen = []
+    once(tmp_path, state(), ends(tmp_path, 1, seen))
+    assert seen == [None]
+
+
+def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_path):
+    once(tmp_path, state(), ends(tmp_path, 1))
+    with pytest.raises(KeyboardInterrupt):
+        once(tmp_path, state(data="e"), cut_short(tmp_path))
+    assert not (tmp_path / "summary.json").exists()
+
+
+def of(file, *words) -> State:
+    """The state of a run on a table of spectra."""
+    config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
+    begun = begin(config)
+    return State.of(config, content(begun.module.measurements), begun.split.sha256)
+
+
+def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
+    """A sweep said again after `split.json` had changed: 3.94 dB of 60 rows where 5.40 of 64 are right."""
+    file, split = spectra(tmp_path / "own.npz"), tmp_path / "split.json"
+    words = "split=file", f"split.path='{split}'"
+    states = []
+    for test in ([8, 9], [7, 9]):
+        folds = (Fold(np.arange(5), np.array([5, 6]), np.array(test)),)
+        write_split(split, Split("own", folds, indices_hash(folds)), 40)
+        states.append(of(file, *words))
+    assert states[0].split != states[1].split and states[0].settings == states[1].settings
+
+
+def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
+    file, states = tmp_path / "own.npz", []
+    for factor in (1, 2):
+        spectra(file)
+        arrays = dict(np.load(file))
+        if factor == 2:
+            name = next(key for key, value in arrays.items() if value.dtype.kind == "f" and value.ndim > 1)
+            arrays[name] = arrays[name][::-1]
+        np.savez(file, **arrays)
+        os.utime(file, (1e9, 1e9))
+        states.append((file.stat().st_size, file.stat().st_mtime_ns, of(file)))
+    (*one, before), (*other, after) = states
+    assert one == other and before.data != after.data
+    (tmp_path / "moved").mkdir()
+    moved = file.rename(tmp_path / "moved" / file.name)
+    assert of(moved) == after  # where the file is does not matter
+
+
+def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
+    walls, states = tmp_path / "walls.yaml", []
+    for text in ("[]", "[1]"):
+        walls.write_text(text)
+        states.append(State.of(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)})))
+    assert states[0].files != states[1].files and states[0].settings == states[1].settings
+
+
+def test_cells_were_current_whose_method_s_own_files_had_changed(tmp_path, monkeypatch):
+    """The key of `gp` hashed 2 files, and none of those of its process."""
+    _, files = _checkout(Path(gsparc.__file__).parent) or pytest.skip("not in a checkout")
+    assert "gsparc/processes/kernel.py" in files and any(one.startswith("ops/") for one in files)
+    package = tmp_path / "toy_program"
+    (package / "processes").mkdir(parents=True)
+    module, page = package / "processes" / "x.py", tmp_path / "page.md"
+    (package / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = []
+    for checkout in (False, True):
+        if checkout:
+            for words in (["init", "-q"], ["add", "toy_program/__init__.py"]):
+                subprocess.run(["git", *words], cwd=tmp_path, check=True)
+        for text in ("VALUE = 1\n", "VALUE = 2\n"):
+            module.write_text(text)
+            page.write_text(text)
+            hashes.append(text_of("toy_program"))
+    assert len(set(hashes)) == 4
+    page.write_text("other words")
+    assert text_of("toy_program") == hashes[-1]
+    sys.modules.pop("toy_program", None)

@@ -1,0 +1,105 @@
+"""Steps that do not pay are not taken: the best validation is kept, and training ends when none is better."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, compose, spectra
+from contexts import loaded, short
+from lightning.pytorch.callbacks import EarlyStopping
+
+from gsparc.callbacks import CostLedger
+from gsparc.field.keep_best import _surely_less
+from gsparc.models.registry import build
+from gsparc.training import curve
+
+COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    file = spectra(tmp_path_factory.mktemp("own") / "own.npz", rows=120)  # 10 of them for validation
+    return file, *loaded(file)
+
+
+def fitted(measured, folder, *more, steps=40, **context):
+    file, data, fold = measured
+    method = build(compose(*brief(file, *COLD, *more)).model)
+    method.fit(data, fold, short(folder, steps, validate_every=5, **context))
+    return method
+
+
+def held_out(method, measured):
+    _, data, fold = measured
+    batch = data.batch(fold.val)
+    return float((method.predict(batch).mean - batch.target).square().mean())
+
+
+def test_steps_that_pay_are_kept(measured, tmp_path):
+    before = fitted(measured, tmp_path / "none", steps=1)
+    after = fitted(measured, tmp_path / "some")
+    assert after.steps >= 10 and held_out(after, measured) < 0.9 * held_out(before, measured)
+
+
+def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
+    """A rate at which every step overshoots."""
+    wild = ("init=images", "model.optimizer.emission=50.0")
+    caplog.set_level("INFO")
+    method = fitted(measured, tmp_path / "wild", *wild)
+    start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
+    assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
+    assert "40 taken, none kept" in caplog.text  # keeping the best ends no training
+
+
+def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):
+    wild = ("init=images", "model.optimizer.emission=50.0")
+    assert fitted(measured, tmp_path / "wild", *wild, "model.refit=true").steps == 0
+    assert fitted(measured, tmp_path / "tame", "model.refit=true").steps >= 10
+
+
+def test_a_resumed_run_ends_with_the_same_parameters(measured, tmp_path):
+    whole = fitted(measured, tmp_path / "whole", every=10)
+    again = fitted(measured, tmp_path / "again", every=10, resume=tmp_path / "whole" / "last.ckpt")
+    first, second = whole.fitted().state_dict(), again.fitted().state_dict()
+    same = [np.allclose(a, second[key]) for key, a in first.items() if isinstance(a, torch.Tensor)]
+    assert all(same) and again.steps == whole.steps
+
+
+def test_a_budget_spent_before_the_first_step_took_steps_that_nothing_spoke_for(measured, tmp_path, caplog):
+    """One step of the first stage chose as many as seconds were left for in the second: 29.1 -> 28.0 dB."""
+    late = fitted(measured, tmp_path / "late", "init=images", "model.refit=true", budget_s=1e-3)
+    assert late.steps == 0 and "none is left for gradient steps" in caplog.text
+
+
+def test_no_steps_of_the_model_took_those_of_the_trainer(measured, tmp_path):
+    """`model=array`, which is solved, took as many gradient steps as `trainer.max_steps` said."""
+    assert fitted(measured, tmp_path, "init=images", "model.steps=0", steps=20).steps_taken == 0
+
+
+@pytest.mark.parametrize("keep_best", [True, False])
+def test_a_second_stage_asked_for_figures_it_has_not_and_took_more_steps(measured, tmp_path, keep_best):
+    """`callbacks=early_stopping` ended in an error; after `trainer.max_time` 391 of 281 steps were kept."""
+    stop = partial(EarlyStopping, "val/error", min_delta=1.0, patience=2)  # the third look ends it
+    more = ("init=images", "model.refit=true", f"model.keep_best={keep_best}")
+    method = fitted(measured, tmp_path, *more, callbacks=lambda: [stop()])
+    assert method.steps_taken == 15 and method.steps in ((0, 5, 10, 15) if keep_best else (15,))
+
+
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [([1, 1, 1, 0.9], False), ([0.9, 0.8, 0.9, 0.85], True), ([1.1, 1.0, 1.2, 1.1], False)],
+)
+def test_a_look_is_kept_where_its_rows_are_better_by_two_standard_errors(errors, kept):
+    """One row of four that gains nothing but noise chose steps that cost the others."""
+    start = torch.ones(4, dtype=torch.float64)
+    assert _surely_less(torch.tensor(errors, dtype=torch.float64), start) == kept
+
+
+def test_the_start_is_the_first_point_of_the_curve_and_the_result_the_last(measured, tmp_path):
+    fitted(measured, tmp_path, "init=images", steps=20, callbacks=lambda: [CostLedger()])
+    rows = curve.read(tmp_path)
+    assert [row["step"] for row in rows] == ["0", "5", "10", "15", "20", "20"]
+    assert rows[0]["what"] == "init=images, closed form" and rows[-1]["what"].startswith("final, ")
+    errors = [float(row["val/psnr_db"]) for row in rows[:-1]]
+    assert min(errors) > errors[0] - 0.1 and rows[-1]["error"] == ""
