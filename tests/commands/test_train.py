@@ -354,7 +354,7 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
         (["init_from={model}", "dataset.file={rx}"], "init_from=.*trained with static_end rx"),
         (["init_from={model}", "dataset.file={csi}"], "init_from=.*trained with kind spectrum"),
         (["init_from={model}", "dataset.file={far}"], "init_from=.*from the model's"),
-        (["init_from={model}", "model=nearest"], "init_from: nearest does not train by gradient"),
+        (["init_from={model}", "model=nearest"], "init_from: nearest takes no weights to start from"),
         (["objective=test/psnr"], "did you mean 'test/psnr_db'"),
         (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
     ],

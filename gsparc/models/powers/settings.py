@@ -46,7 +46,7 @@ SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one leng
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
 LOOKS, SETTLED = 40, 5e-6
-EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-5
+EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
