@@ -228,7 +228,9 @@ def _check(
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
     if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
-        raise ValueError(f"init_from: {method.name} takes no weights to start from, Gaussian fields do; start without it")
+        raise ValueError(
+            f"init_from: {method.name} takes no weights to start from, Gaussian fields do; start without it"
+        )
     if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
 

@@ -307,7 +307,7 @@ class Measurements:
         """Return rows (n,) alone, seen as measurements of `site`."""
 
         def of(value: Any) -> Any:
-            return [value[i] for i in rows] if isinstance(value, list) else take(value, rows)
+            return [value[i] for i in rows if value] if isinstance(value, list) else take(value, rows)
 
         whole = ("site", "provenance", "release_split")
         arrays = {name: value for name, value in vars(self).items() if name not in whole}

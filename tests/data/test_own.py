@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -33,6 +35,11 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
     np.testing.assert_allclose(read.noise_variance * read.site.target_scale**2, 0.02, rtol=1e-6)
     assert np.array_equal(read.position_std, arrays["position_std"])
     assert np.array_equal(read.subset(np.arange(3)).position_std, arrays["position_std"][:3])
+
+
+def test_a_subset_of_rows_without_names_was_an_index_error(csi_arrays):
+    read = replace(from_arrays(csi_arrays), row_names=[])
+    assert len(read.subset(np.arange(3))) == 3
 
 
 def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_arrays):
