@@ -24,7 +24,7 @@ from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
-from gsparc.data.files import is_address, set_aside
+from gsparc.data.files import SUMMARY, is_address, set_aside
 from gsparc.data.instantiate import find, node_of, suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Scored
@@ -170,7 +170,7 @@ def train(
                 _draw(loggers, config, facts, objects, run_dir)
         samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
         summary.write_samples(run_dir / "per_sample.csv", samples)
-        summary.write_summary(run_dir / summary.SUMMARY, facts)
+        summary.write_summary(run_dir / SUMMARY, facts)
         return facts, objects
 
 

@@ -20,6 +20,7 @@ import yaml
 
 from gsparc.data.errors import DataError, reason
 
+SUMMARY = "summary.json"  # of a finished run, written last
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
 MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
 LEAST_NODES = 10_000  # of YAML that are not counted

@@ -23,7 +23,6 @@ from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
-SUMMARY = "summary.json"
 WITH_SILENT = "rmse_db_with_silent"
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 

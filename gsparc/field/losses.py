@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -111,22 +112,38 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
 
 
-def task_loss(prediction: Tensor, batch: Batch, ssim_weight: float, snapshot: Snapshot = "none") -> Tensor:
+class LossOf(Protocol):
+    """What `task_loss` reads, each where targets call for it.
+
+    Attributes:
+        ssim_weight: see `spectrum_loss`.
+        snapshot: see `channel_loss`; powers have no phase.
+    """
+
+    @property
+    def ssim_weight(self) -> float:
+        """Share of SSIM in the loss of spectra."""
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """Unknown offset of each row of channels."""
+
+
+def task_loss(prediction: Tensor, batch: Batch, settings: LossOf) -> Tensor:
     """Loss (B,) of spectra, channels or powers; what was not measured counts as met.
 
     Args:
         prediction: like the targets of `batch`.
         batch: with targets and mask.
-        ssim_weight: see `spectrum_loss`.
-        snapshot: see `channel_loss`; powers have no phase.
+        settings: read as far as these targets need: what is not read has no effect, and is said.
     """
     if prediction.is_complex():
-        return channel_loss(prediction, batch.target, batch.mask, snapshot)
+        return channel_loss(prediction, batch.target, batch.mask, settings.snapshot)
     if prediction.dim() == 2:
         return channel_loss(prediction, batch.target, batch.mask)
     if batch.mask is not None:
         prediction = torch.where(batch.mask, prediction, batch.target)
-    return spectrum_loss(prediction, batch.target, ssim_weight)
+    return spectrum_loss(prediction, batch.target, settings.ssim_weight)
 
 
 def channel_loss(

@@ -232,7 +232,7 @@ class GaussianModule(NetworkModule):
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Loss per sample (B,) before confidence; what was not measured counts as met."""
-        return task_loss(prediction, batch, self.loss.ssim_weight, self.loss.snapshot)
+        return task_loss(prediction, batch, self.loss)
 
     def _render(self, batch: Batch) -> Rendered:
         try:

@@ -96,18 +96,19 @@ class Shared:
             self._blocks[number] = Block.of(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+    def answer(self, queries: Tensor, number: Tensor, exact: bool = False) -> tuple[Tensor, Tensor]:
         """Return the mean and variance of a measurement, each (B,).
 
         Args:
             queries: (B, D) float64.
             number: (B,) int64, of the process; one that is not there has no rows.
+            exact: whether variances of few queries are of double precision too, as their slopes need it.
         """
         own, columns = self.never.columns(queries), self.columns(queries)
         mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for one in number.unique().tolist():
             for at in (number == one).nonzero()[:, 0].split(QUERIES):
-                said = self._said(queries[at], one, own[at], columns[at], len(at) <= ROUNDED)
+                said = self._said(queries[at], one, own[at], columns[at], not exact and len(at) <= ROUNDED)
                 mean = mean.index_add(0, at, said.more)
                 prior = said.prior.kernel.amplitude * said.prior.variance(own[at])
                 known = prior if said.white is None else (prior - said.white.square().sum(1)).clamp_min(0.0)

@@ -30,7 +30,7 @@ def test_every_parameter_has_its_rate():
     assert (
         kind_of("gaussians.means") == "positions" and kind_of("confidence.network.0.weight") == "confidence"
     )
-    with pytest.raises(KeyError, match=r"gsparc\.training\.optimizer\.KINDS"):
+    with pytest.raises(KeyError, match=r"gsparc\.field\.optimizer\.KINDS"):
         kind_of("gaussians.means_too")
 
 

@@ -16,8 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.files import set_aside, sweep
-from gsparc.evaluation.summary import SUMMARY
+from gsparc.data.files import SUMMARY, set_aside, sweep
 
 LOCK, HOLDER = ".lock", ".held-by"
 _locks: list[FileLock] = []  # by the command that is running

@@ -21,10 +21,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.assemble import content_hash, identity
 from gsparc.data.errors import DataError
-from gsparc.data.files import set_aside, whole_file
+from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import targets
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.summary import SUMMARY, read_summary
+from gsparc.evaluation.summary import read_summary
 from gsparc.models.parts import LAST, leaves
 
 log = logging.getLogger(__name__)

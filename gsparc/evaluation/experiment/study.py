@@ -13,12 +13,13 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.executor import each
+from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, once
 from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
-from gsparc.evaluation.summary import SUMMARY, provenance, write_summary
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.refined_places import displaced as elsewhere

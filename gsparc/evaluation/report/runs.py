@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.files import load_yaml
+from gsparc.data.files import SUMMARY, load_yaml
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import SUMMARY, read_summary, write_samples
+from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.parts import leaves
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles

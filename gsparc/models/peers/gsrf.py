@@ -88,7 +88,7 @@ class ComplexGaussians(GaussianNetwork):
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
-        plain = task_loss(seen, batch, self.ssim_weight).mean()
+        plain = task_loss(seen, batch, self).mean()
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
         difference = torch.fft.rfft2(seen - batch.target, norm="ortho").abs().mean()

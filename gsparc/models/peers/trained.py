@@ -16,6 +16,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.fit import run_stage, steps_asked_for
+from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
 from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
@@ -72,6 +73,7 @@ class Network(nn.Module):
     """
 
     ssim_weight = 0.2  # share of the loss of spectra
+    snapshot: Snapshot = "none"
 
     def __init__(self, scene: Scene, count: int = 0) -> None:
         super().__init__()
@@ -79,7 +81,7 @@ class Network(nn.Module):
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Training loss () of a batch; `draw` for whatever is drawn at random."""
-        return task_loss(self(batch.tx, batch.rx), batch, self.ssim_weight).mean()
+        return task_loss(self(batch.tx, batch.rx), batch, self).mean()
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:

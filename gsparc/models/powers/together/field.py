@@ -158,9 +158,10 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         places, number = self._by_process(*self._ends(query))
         mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
+        exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
             if chosen.any():
-                mean[chosen], left = of.answer(places[chosen], number[chosen])
+                mean[chosen], left = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
