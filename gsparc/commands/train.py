@@ -149,7 +149,7 @@ def train(
             whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
-                # `Method.fit` of every fold. For gradient steps training/fit.py `run_stage` makes the Trainer
+                # `Method.fit` of every fold. For gradient steps field/fit.py `run_stage` makes the Trainer
                 # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(partial(deepcopy, method), data, split, contexts, keep=keep)

@@ -17,7 +17,6 @@ from gsparc.ops.transforms import carries_tangent
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
-"""Unknown offset of each snapshot: none, a phase, or a phase and a delay."""
 
 DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in the gradient
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1

@@ -114,6 +114,8 @@ class Gsparc(LearnsTogether):
         self.site, self.chosen = data.site, choose(data, self)
         log.info("%s is model=%s here", self.name, self.chosen.name)
         self.chosen.name = self.name
+        if context.init_from is not None and self.chosen is not self.rendered:
+            raise ValueError(f"init_from: {self.name} is in closed form here, without weights to start from")
         if self.chosen is self.rendered:
             errors_of(data, fold, self.position_std, heeds=False)
         return self.chosen.fit(data, fold, context)
@@ -168,5 +170,5 @@ class Gsparc(LearnsTogether):
         return self.rendered.module()
 
     def trainer_options(self) -> bool:
-        """See `TrainsByGradient`."""
-        return True
+        """See `TrainsByGradient`; before `fit` the site has not been seen."""
+        return self.chosen is self.rendered

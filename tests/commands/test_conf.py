@@ -79,7 +79,7 @@ def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
-    """A new `auto` must be settled (training/auto_settings.py, training/terms.py) and be named here."""
+    """A new `auto` must be settled (models/splat/auto_settings.py, models/terms.py) and be named here."""
 
     def still_open(node: dict, prefix: str = ""):
         for key, value in node.items():

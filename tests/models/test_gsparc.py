@@ -32,7 +32,7 @@ from gsparc.models.registry import build, method_class
 from gsparc.models.splat.averaged import ImageProcess
 from gsparc.ops import Pose
 from gsparc.training import race
-from gsparc.training.context import FitReport
+from gsparc.training.context import FitContext, FitReport
 
 SMALL = (
     "model.field.count=40", "init.searches=1", "init.search_rows=60", "init.max_sources=9"
@@ -324,3 +324,10 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         method_class("gsparc")().fit(data, fold, short(tmp_path, 10, budget_s=5.0))
     assert len(given) == 1 and 4 < given[0] < 5
+
+
+def test_weights_to_start_from_were_ignored_in_closed_form(tmp_path):
+    data = KINDS["powers"](tmp_path)
+    context = FitContext(init_from=tmp_path / "model.ckpt")
+    with pytest.raises(ValueError, match="init_from: gsparc is in closed form here"):
+        method_class("gsparc")().fit(data, fold_of(data), context)

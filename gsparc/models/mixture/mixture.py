@@ -28,45 +28,28 @@ from gsparc.training.time_budget import less_repeatable
 log = logging.getLogger(__name__)
 
 
-class Mixture(ClosedForm, kind="mixture"):
+class Mixture(ClosedForm):
     """The weighed mean of members: no single one need be the right one.
 
     Args:
-        names: of `CANDIDATES` that `fit` tries.
-        init: their settings.
+        init: settings of candidates.
         effects: switches of terms, of which `visibility` and `residual` are heeded.
     """
 
-    name = "mixture"
     has_gaussians = True
 
-    def __init__(
-        self, names: Sequence[str] = (), init: InitSettings | None = None,
-        effects: EffectSettings = EffectSettings(),
-    ) -> None:  # fmt: skip
-        self.tried, self.init, self.switches = tuple(names), init or InitSettings(), effects
+    def __init__(self, init: InitSettings, effects: EffectSettings) -> None:
+        self.init, self.switches = init, effects
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
         self.explained: float | None = None  # share of the variance of validation rows, by Gaussians
         self.init_s: float | None = None
 
-    @classmethod
-    def of(cls, members: Sequence[ClosedForm], weights: Sequence[float] = (1.0,)) -> Mixture:
-        """That of fitted members."""
-        result = cls()
-        result.members, result.weights = list(members), tuple(float(weight) for weight in weights)
-        result.site = members[0].site
-        return result
-
-    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """See `weighed`."""
-        return self.weighed(self.tried, self.init, data, fold, context)
-
-    def weighed(
+    def fit_members(
         self, names: Sequence[str], init: InitSettings, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        """Fit every candidate, weigh them by rows held out where they are several, condition on all rows.
+        """Fit candidates by name, weigh several by rows held out, and condition them on all rows.
 
         Raises:
             ValueError: the only candidate, or the one asked for, cannot solve this.
@@ -139,6 +122,8 @@ class Mixture(ClosedForm, kind="mixture"):
     def left_out(self) -> LeftOutRows:
         """The mean of all."""
         result = [member.left_out() for member in self.members]
+        if len({one.mean.shape for one in result}) > 1:
+            raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
         pairs = list(zip(self.weights, result, strict=True))
         mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
         variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)

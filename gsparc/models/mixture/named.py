@@ -61,7 +61,7 @@ class NamedMixture(LearnsTogether, Mixture):
         init: InitSettings | None = None, residual_alone: bool = False,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
-        super().__init__((), init or InitSettings(), effects)
+        super().__init__(init or InitSettings(), effects)
         self.position_std, self.residual_alone = position_std, residual_alone
         self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
 
@@ -143,7 +143,7 @@ class NamedMixture(LearnsTogether, Mixture):
         self.runs = _runs(data, known, context)
         aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
         within = replace(context, budget_s=budget.left_s)
-        report = self.weighed(parts, init, self.runs.aligned(data), fold, within)
+        report = self.fit_members(parts, init, self.runs.aligned(data), fold, within)
         if not aligning:
             return report
         cost = Cost({"factors of runs": aligning}) + report.cost
@@ -187,7 +187,8 @@ class NamedMixture(LearnsTogether, Mixture):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        return () if self.only is None else knobs(self.only)
+        # What answers faster knows nothing of runs' factors.
+        return () if self.only is None or len(self.runs) > 1 else knobs(self.only)
 
     def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
         """See `Reducible`."""
@@ -195,7 +196,7 @@ class NamedMixture(LearnsTogether, Mixture):
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        return self if self.only is None or not knobs(self.only) else reduced(self.only, settings, measured)
+        return self if self.only is None or not self.knobs() else reduced(self.only, settings, measured)
 
     # -- storing -----------------------------------------------------------------------------------
 

@@ -136,6 +136,8 @@ def weighed(
 
     Those are validation rows, and training rows as `cut`; one solution needs neither.
     """
+    if not solutions:
+        raise ValueError("no candidate could solve this: the lines above say why")
     first = next(iter(solutions))
     if len(solutions) == 1:
         return {first: (solutions[first], 1.0)}
