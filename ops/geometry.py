@@ -190,8 +190,8 @@ class SphereGrid:
     def edges(self) -> tuple[float, float, float, float]:
         """Return least and largest azimuth, least and largest elevation of the pixels' edges [degrees].
 
-        >>> [round(edge, 3) for edge in SphereGrid.hemisphere(90, 360).edges()]
-        [-0.5, 359.5, -0.5, 89.5]
+        >>> tuple(round(edge, 3) for edge in SphereGrid.hemisphere(90, 360).edges())
+        (-0.5, 359.5, -0.5, 89.5)
         """
         across, up = math.degrees(self.azimuth_step), math.degrees(self.elevation_step)
         left, low = math.degrees(self.first_azimuth) - across / 2, math.degrees(self.first_elevation) - up / 2

@@ -23,8 +23,8 @@ class Query:
     Precision follows that of the places: float32, or float64 where autograd is to follow the answer.
 
     >>> query = Query(tx=torch.zeros(5, 3), rx=Pose.identity(torch.zeros(3)))  # one receiver for all
-    >>> [len(part) for part in query.split(2)]
-    [2, 2, 1]
+    >>> tuple(len(part) for part in query.split(2))
+    (2, 2, 1)
 
     Attributes:
         tx: (B, 3) [m].

@@ -209,7 +209,9 @@ def run_stage(
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
-    heeded.count("trainer", "callbacks")
+    # Without validation rows nothing is looked at, however often that was asked for.
+    unwatched = (f"trainer.{name}" for name in make.keywords if name != "val_check_interval")
+    heeded.count("callbacks", *(["trainer"] if len(fold.val) else unwatched))
     processes = Processes.named(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":

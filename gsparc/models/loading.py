@@ -40,8 +40,7 @@ def restore(stored: checkpoint.Stored) -> Method:
             raise checkpoint.CheckpointError(
                 f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
             )
-        method = PerStation(make) if "per_station" in stored.state else make()
-        method.restore(stored.site, stored.state)
+        method = made_again(make, stored)
     except checkpoint.CheckpointError:
         raise
     except Exception as error:  # the state comes from a file: anything may be wrong with it
@@ -49,6 +48,13 @@ def restore(stored: checkpoint.Stored) -> Method:
         raise checkpoint.CheckpointError(
             f"{stored.path}: {stored.method} cannot be restored ({reason})"
         ) from error
+    return method
+
+
+def made_again(make: Callable[[], Method], stored: checkpoint.Stored) -> Method:
+    """Return what `make` makes, or a copy of it for each station, with a stored state."""
+    method = PerStation(make) if "per_station" in stored.state else make()
+    method.restore(stored.site, stored.state)
     return method
 
 

@@ -195,7 +195,8 @@ class Study:
                 made = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
                 fits[learned] = made.scored_on(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
-                checkpoint.save(learned.model(folder), made.methods[0], context.config_yaml, extra)
+                # Without the configuration of the study: a variant has other settings.
+                checkpoint.save(learned.model(folder), made.methods[0], "", extra)
             outcome = fits[learned]
             if condition.what == "query":
                 outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
@@ -221,7 +222,10 @@ class Study:
         groups = cells.groupby(["variant", "what", "amount"], sort=False)
         rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
-        methods = {file: loading.load(file)[0] for file in dict.fromkeys(rows.model)}
+        methods = {
+            file: loading.made_again(self.variants[variant], checkpoint.read(file))
+            for file, variant in zip(rows.model, rows.variant, strict=True)
+        }
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [percentiles(times[file]) for file in rows.model]
         rows["query_ratio"] = self._ratio(rows, "query_ms", ["what", "amount"])

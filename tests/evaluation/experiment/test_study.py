@@ -31,7 +31,8 @@ def run(monkeypatch, tmp_path):
     monkeypatch.setattr(
         study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
     )
-    monkeypatch.setattr(study.loading, "load", lambda path: (kept[path], None))
+    monkeypatch.setattr(study.checkpoint, "read", kept.get)
+    monkeypatch.setattr(study.loading, "made_again", lambda make, stored: stored)
     context = FitContext(tmp_path, seed=5, budget_s=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 

@@ -117,7 +117,7 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
         found = field.predict(batch)
         of_places = field.predict(Query(batch.tx, batch.rx))
         torch.testing.assert_close(of_places.mean, found.mean)
-        heard = field(same)
+        heard = field.predict(same)
     missed = (found.mean - batch.target).abs().square().mean()
     assert missed < 0.9 * batch.target.abs().square().mean()
     assert 0.2 < float(missed / found.variance.mean()) < 4
