@@ -103,7 +103,7 @@ class Gsparc(LearnsTogether):
         name: str = "gsparc", **field: Any,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
-        self.rendered = ImageProcess(name=name, **field)
+        self.rendered = ImageProcess(plain=effects.residual is not False, name=name, **field)
         self.rendered.chosen_by = type(self)
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std = effects, position_std

@@ -89,7 +89,6 @@ class ChannelField(ClosedForm, kind="diffuse"):
     """
 
     name = "waves"
-    both_ends = True
     site: Site
     values: Values  # the terms and their numbers
     channel: tuple[int, int]  # (A, K) of the targets

@@ -51,7 +51,6 @@ class PowerField(ClosedForm, kind="powers"):
     """
 
     name = "process of powers"
-    both_ends = uses_censored = True
     site: Site
     trend: Trend  # the mean law
     kernel: Kernel

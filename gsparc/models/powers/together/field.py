@@ -50,7 +50,6 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
     """
 
     name = "process of many stations' powers"
-    both_ends = uses_censored = True
     site: Site
     places: np.ndarray  # (T, 3) float64 of the stations [m]
     own: Own  # of the stations' own processes
