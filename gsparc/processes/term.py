@@ -1,0 +1,42 @@
+"""A term of a covariance, one object in one file: what it says of two sets of rows, and its parameters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, Generic, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
+
+
+class Term(ABC, Generic[Rows]):
+    """One additive part of what is known of values before any row; a prior is a sum of terms.
+
+    Numbers of a term may be floats, or tensors with gradients where they are being learned.
+    """
+
+    @abstractmethod
+    def covariance(self, a: Rows, b: Rows) -> Tensor:
+        """Return the covariance (n, m) of values at rows `a` (n) and `b` (m), real or complex."""
+
+    @abstractmethod
+    def variance(self, a: Rows) -> Tensor:
+        """Return the variance (n,) of values at rows `a`, the diagonal of `covariance(a, a)`."""
+
+    def parameters(self) -> Tensor:
+        """Return what is learned of it (p,) float64, unbounded: logarithms of powers and lengths."""
+        return torch.zeros(0, dtype=torch.float64)
+
+    def bounds(self, scale: float) -> list[tuple[float, float]]:
+        """Return bounds of each parameter, for rows whose distances are about `scale` [m]."""
+        return []
+
+    def at(self, parameters: Tensor) -> Self:
+        """Return the term with other parameters (p,), through which gradients flow."""
+        return self
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Return tensors and numbers that make it again."""
