@@ -70,9 +70,9 @@ def baseline(
     unseen = eval_on == "val" and learned is None
     methods, seconds = [], []
     for number, fold in enumerate(before.folds):
-        method = for_links(method_class(name), own)
         known = replace(fold, val=fold.val[:0]) if unseen else fold
-        report = parts.fit(method, own, known, FitContext(Path()))
+        factory = for_links(method_class(name)(), own)
+        method, report = parts.fit(factory, own, known, FitContext(Path()))
         for note in report.notes:
             log.info("fold %d: %s", number, note)
         methods.append(method)

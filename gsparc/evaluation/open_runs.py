@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.scores import rows_of
 from gsparc.models import checkpoint, loading
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import build
 from gsparc.prediction.confidence import Trusted, gather, keep, known_positions, position_kernel, threshold_of
 from gsparc.prediction.query import SAME_PLACE_M
@@ -62,8 +61,8 @@ class Opened:
         own = {"split/foreign": self.foreign, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | own
 
-    def retraining(self, **others: Any) -> tuple[Callable[[], Method], FitContext]:
-        """What makes the method unfitted, of gsparc's classes alone, and the context that it was fitted in.
+    def retraining(self, **others: Any) -> tuple[MethodFactory, FitContext]:
+        """What makes the method, of gsparc's classes alone, and the context that it was fitted in.
 
         Args:
             **others: of `FitContext`, in place of the run's.
@@ -81,7 +80,7 @@ class Opened:
             "stations": config.get("stations", "auto"),
             "split": None if split is None else split_settings(split),
         }  # fmt: skip
-        return partial(build, config["model"], trusted=False), FitContext(**own | others)
+        return build(config["model"], trusted=False), FitContext(**own | others)
 
 
 def open_files(

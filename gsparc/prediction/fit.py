@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +72,10 @@ def fit(
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
-    method = for_links(partial(method_class(model), **(settings or {})), data)
-    fold = _learned_from(data, VALIDATED if method.takes_budget else 0.0, seed)
-    report = parts.fit(method, data, fold, FitContext(seed=seed, effort=effort, budget_s=budget_s))
+    factory = for_links(method_class(model)(**(settings or {})), data)
+    fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
+    context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
+    method, report = parts.fit(factory, data, fold, context)
     for note in report.notes:
         log.info("%s", note)
     if save is not None:

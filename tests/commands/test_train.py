@@ -90,7 +90,7 @@ def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
-    assert isinstance(objects, Objects) and isinstance(objects.methods[0].chosen, LearnedField)
+    assert isinstance(objects, Objects) and isinstance(objects.methods[0], LearnedField)
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"model.ckpt", "per_sample.csv", "split.json", "learning_curve.csv"} <= written
 

@@ -37,7 +37,7 @@ def town(chosen=(0, 1, 2), **changes):
 def test_stations_in_another_order_were_answered_by_each_other(chosen):
     """One file lists the stations of a model in another order, or some of them: 31 dB off without a word."""
     data, other = town(), town(chosen)
-    method = for_links(method_class("idw"), data)
+    method = for_links(method_class("idw")(), data)
     method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
     same = aligned(other, data.site)
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
@@ -161,10 +161,11 @@ def test_locate_built_whatever_class_a_checkpoint_named():
     """Settings that the stored class does not follow were instantiated, `os.system` as well."""
     settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "budget_s": 2.0}
     run = Opened([], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, None)
-    make, context = run.retraining(budget_s=5.0)
-    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
     with pytest.raises(ValueError, match=r"os\.system.*refused"):
-        make()
+        run.retraining(budget_s=5.0)
+    settings["model"] = {"_target_": "gsparc.models.baselines.nearest.Nearest"}
+    _, context = run.retraining(budget_s=5.0)
+    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
     run.stored[0].configuration = {}
     with pytest.raises(DataError, match=r"a\.ckpt does not say how it was trained"):
         run.retraining()

@@ -25,7 +25,7 @@ def measured(tmp_path_factory):
 
 def fitted(measured, folder, *more, steps=40, **context):
     file, data, fold = measured
-    method = build(compose(*brief(file, *COLD, *more)).model)
+    method = build(compose(*brief(file, *COLD, *more)).model).made_for(data)
     method.fit(data, fold, short(folder, steps, validate_every=5, **context))
     return method
 

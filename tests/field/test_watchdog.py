@@ -32,7 +32,7 @@ def test_every_phase_looks_at_clock_and_interrupt(kind, tmp_path):
     data = make(tmp_path)
     data = data if hasattr(data, "site") else load({"name": "own", "file": str(data)})
     config = compose("dataset=own", "dataset.file=x", f"budget_s={budget_s}", "logger=none", *overrides)
-    method = build(config.model)
+    method = build(config.model).made_for(data)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

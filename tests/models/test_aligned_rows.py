@@ -104,8 +104,7 @@ def test_stations_that_are_missing_took_the_places_of_others():
 
 def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
     fold = packets.shares(logged, 0)
-    method = Gsparc(position_std=0.001)
-    parts.fit(method, logged, fold, FitContext())
+    method, _ = parts.fit(Gsparc(position_std=0.001), logged, fold, FitContext())
     assert "position_std is not used" in caplog.text and method.made.startswith("aligned")
 
 

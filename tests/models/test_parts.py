@@ -39,7 +39,7 @@ def town():
 
 def fitted(town, folder, stop_at=0, **more):
     Resumable.fits, Resumable.stop_at = 0, stop_at
-    method = PerStation(Resumable)
+    method = PerStation(Resumable())
     method.fit(*town, FitContext(folder, **more))
     return method
 
@@ -81,11 +81,10 @@ def test_a_run_that_begins_anew_leaves_no_parts_of_the_one_before(town, tmp_path
 def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     data, fold = town
     context = FitContext(tmp_path / "fold0", stations="each")
-    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable), 0, 0
+    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
     checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=parts.marks(report, data, fold, context))
-    again = PerStation(Resumable)
-    found = parts.fit(again, data, fold, replace(context, resume=tmp_path / "fold0"))
+    again, found = parts.fit(PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0"))
     assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
 
 

@@ -13,6 +13,7 @@ from scenes import fold_of
 from gsparc.data.splits import SplitSettings
 from gsparc.models import stations
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.mixture.named import NamedMixture
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
@@ -67,15 +68,15 @@ def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkey
     data = heard(30, csi=channels, frequency_hz=np.array(9.2e8))
     fold = fold_of(data)
     fits = []
-    monkeypatch.setattr(Gsparc, "fit", lambda self, *given: fits.append(given) or 1 / 0)
+    monkeypatch.setattr(NamedMixture, "fit", lambda self, *given: fits.append(given) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        PerStation(Gsparc).fit(data, fold, FitContext(tmp_path))
+        PerStation(Gsparc()).fit(data, fold, FitContext(tmp_path))
     assert len(fits) == 1 and len(fits[0][0]) == len(data)
     assert "stations=auto -> together: channels" in caplog.text
-    plain = PerStation(method_class("nearest"))
+    plain = PerStation(method_class("nearest")())
     plain.fit(data, fold, FitContext(tmp_path))
     assert len(dict(plain)) == len(POSTS) and caplog.text.count("stations=auto") == 1
-    each = PerStation(Gsparc)
+    each = PerStation(Gsparc())
     with pytest.raises(ZeroDivisionError):
         each.fit(data, fold, replace(FitContext(tmp_path), stations="each"))
     assert len(fits) == 2 and fits[1][2].budget_s is None

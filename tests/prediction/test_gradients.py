@@ -28,7 +28,7 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.mixture.named import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
@@ -86,7 +86,7 @@ def images(folder: Path, rows: int, moving: str = "tx") -> Measurements:
     return load({"name": "own", "file": str(spectra(folder / "own.npz", rows, moving))})
 
 
-def planned(*more: str) -> Callable[[], Method]:
+def planned(*more: str) -> Callable[[], MethodFactory]:
     return lambda: build(compose("model=gsparc", *more).model)
 
 
@@ -175,7 +175,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             for module in (gp, complex_gp, powers):
                 patch.setattr(module, "MOST_ROWS", 30)
             patch.setattr(complex_gp, "NEAREST", 20)
-        method = for_links(case.make, data)
+        method = for_links(case.make(), data).made_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
         budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))

@@ -142,7 +142,7 @@ def abroad(tmp_path):
             "rssi_db": rng.normal(0, 1, (40, 2)) - [50, 80],
         }
     )
-    method = for_links(GaussianProcess, data)
+    method = for_links(GaussianProcess(), data)
     rows = np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:4]), FitContext(tmp_path))
     checkpoint.save(tmp_path / "gp.ckpt", method)

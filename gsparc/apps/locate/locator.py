@@ -22,7 +22,8 @@ from gsparc.apps.locate.snapshots import Snapshots, snapshots
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.method import Method
+from gsparc.models import parts
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import for_links
 from gsparc.training.context import FitContext
 
@@ -129,7 +130,7 @@ class Locator:
 
 
 def trusted(
-    make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, locator: Locator,
+    factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext, locator: Locator,
     folds: int, cells: Callable[[np.ndarray], Cells],
 ) -> tuple[Trust, int]:  # fmt: skip
     """How far such a method is trusted, from training places that it left out, and their number.
@@ -142,8 +143,7 @@ def trusted(
     inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
     for number, inner in enumerate(inner_folds):
         log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
-        method = for_links(make, data)
-        method.fit(data, inner, context.within(f"group{number}"))
+        method, _ = parts.fit(for_links(factory, data), data, inner, context.within(f"group{number}"))
         rows = np.union1d(inner.train, inner.val)
         without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)

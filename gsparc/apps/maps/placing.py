@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -19,7 +18,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
@@ -156,7 +155,7 @@ def place_next(
 
 def new_station_error(
     method: Method,
-    make: Callable[[], Method],
+    factory: MethodFactory,
     data: Measurements,
     fold: Fold,
     context: FitContext,
@@ -173,7 +172,7 @@ def new_station_error(
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        learned = without(method, make, data, inner, context)
+        learned = without(method, factory, data, inner, context)
         parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
     errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
     means = np.array([error.mean() for error in errors if len(error)])

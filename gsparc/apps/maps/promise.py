@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models import checkpoint
-from gsparc.models.method import Method, Reconditions, predictions
+from gsparc.models import checkpoint, parts
+from gsparc.models.method import Method, MethodFactory, Reconditions, predictions
 from gsparc.models.per_station import PerStation, for_links, trained_stations
 from gsparc.training.context import FitContext
 
@@ -93,7 +93,7 @@ def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
 
 def gather(
     method: Method,
-    make: Callable[[], Method],
+    factory: MethodFactory,
     data: Measurements,
     fold: Fold,
     settings: PromiseSettings,
@@ -105,7 +105,7 @@ def gather(
 
     Args:
         method: fitted on the fold.
-        make: an unfitted copy of it.
+        factory: made it unfitted.
         data, fold: that the model learned from.
         settings: see there.
         context: of the refits.
@@ -127,7 +127,7 @@ def gather(
         split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
         cut = cut_inside(data, fold, split, 1, settings.seed + number // len(SIDES))
         inner = answerable(method, data, cut.folds[0])
-        learned = without(method, make, data, inner, replace(context, split=split))
+        learned = without(method, factory, data, inner, replace(context, split=split))
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         unit = cut.unit[tried] + number * (len(data) + 1)
@@ -140,24 +140,23 @@ def gather(
 
 
 def without(
-    method: Method, make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext
+    method: Method, factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext
 ) -> Method:
     """A method that knows nothing of the test rows of a fold."""
     if isinstance(method, Reconditions):
         refit = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
         if refit is not None:
             return refit
-    refit = for_links(make, data)
     with tempfile.TemporaryDirectory() as folder:
-        refit.fit(data, fold, replace(context, run_dir=Path(folder)))
-    return refit
+        own = replace(context, run_dir=Path(folder))
+        return parts.fit(for_links(factory, data), data, fold, own)[0]
 
 
 def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:
     """The fold without test rows of stations that too few training rows are left of."""
     if not isinstance(method, PerStation):
         return fold
-    known, _ = trained_stations(method.wrapped, data, fold)
+    known, _ = trained_stations(method.factory, data, fold)
     assert data.station is not None
     return replace(fold, test=fold.test[known[data.station[fold.test]]])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import open_files
 from gsparc.models import checkpoint
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -39,9 +39,9 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     promise = None if settings.get("renew") else stored_promise(stored.extra)
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
-    method, make, data, fold, context = trained(path, settings["dataset"])
+    method, factory, data, fold, context = trained(path, settings["dataset"])
     log.info("a promise for this map: %d fits without blocks of places", how.folds)
-    promise = gather(method, make, data, fold, how, context)
+    promise = gather(method, factory, data, fold, how, context)
     promise.coverage(how.share)  # too little evidence is said before anything is stored
     promise.keep(path)
     return promise
@@ -49,22 +49,22 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
 
 def trained(
     path: str, dataset: dict[str, Any]
-) -> tuple[Method, Callable[[], Method], Measurements, Fold, FitContext]:
-    """A model, an unfitted copy, the very data and rows that it was trained on, and how.
+) -> tuple[Method, MethodFactory, Measurements, Fold, FitContext]:
+    """A model, what made it, the very data and rows that it was trained on, and how.
 
     Raises:
         DataError: they are gone, or are others.
     """
     try:
         run = open_files([path], dataset)
-        make, context = run.retraining()
+        factory, context = run.retraining()
     except (ValueError, OSError) as error:
         raise DataError(
             f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
         ) from None
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
-    return run.methods[0], make, run.data, run.split.folds[0], context
+    return run.methods[0], factory, run.data, run.split.folds[0], context
 
 
 def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
-from gsparc.models.method import Method
+from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import displaced as elsewhere
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext
@@ -110,7 +110,7 @@ class Study:
     """What is compared.
 
     Attributes:
-        variants: what makes an unfitted method, by name, in the order of the table.
+        variants: what makes their methods, by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
         base: name of the variant that times are compared with; None: no ratios.
         rounds: trainings of each, in turns; round r uses seed + r.
@@ -118,7 +118,7 @@ class Study:
         clock: of the queries.
     """
 
-    variants: Mapping[str, Callable[[], Method]]
+    variants: Mapping[str, MethodFactory]
     conditions: Sequence[Condition] = (Condition(),)
     base: str | None = None
     rounds: int = 1

@@ -109,7 +109,8 @@ class NamedMixture(LearnsTogether, Mixture):
             read_walls(self.init.file)  # its errors come before anything is computed
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = site.kind != "spectrum" and site.static_end is not None and phases
-        if (std := errors_of(data, fold, self.position_std, heeds)) is not None:
+        known = np.concatenate([fold.train, fold.val])
+        if (std := errors_of(data, known, self.position_std, heeds)) is not None:
             return self._fit_refined(parts, init, data, fold, context, std)
         return self._solve(parts, init, data, fold, context)
 

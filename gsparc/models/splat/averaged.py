@@ -44,14 +44,8 @@ class ImageProcess(LearnedField):
         super().__init__(name=name, **field)
         self.plain = plain
         self.explained: float | None = None
-        self.chosen_by: type[Method] = type(self)  # as whose its checkpoints are read back
         self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
         self._average_mean: Method | None = None  # that process without its variance, made when first asked
-
-    @property
-    def stored_as(self) -> type[Method]:
-        """See `Method`."""
-        return self.chosen_by
 
     @property
     def effects(self) -> str:  # type: ignore[override]
@@ -60,12 +54,6 @@ class ImageProcess(LearnedField):
             return "residual"
         base = "array" if self.settings.response.array else "image"
         return base + ("+residual" if self._average is not None else "")
-
-    def called_for(self, array: bool, plain: bool) -> ImageProcess:
-        """Let Gaussians emit fields that the static receiver's array images, or images; return the method."""
-        self.settings = replace(self.settings, response=replace(self.settings.response, array=array))
-        self.plain, self.name = plain, "array_process" if array else "image_process"
-        return self
 
     # -- learning ----------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from gsparc.training.context import FitContext
 def together(tmp_path_factory):
     folder: Path = tmp_path_factory.mktemp("together")
     data = load_own(town_file(folder / "town.npz"))
-    method, rows = for_links(method_class("distance_law"), data), np.arange(len(data))
+    method, rows = for_links(method_class("distance_law")(), data), np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(folder, stations="together"))
     checkpoint.save(folder / "model.ckpt", method)
     return method, data, folder / "model.ckpt"

@@ -19,7 +19,7 @@ def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, 
     def outcome():
         context = in_folders(FitContext(tmp_path), split)
         keep = lambda number, *unused: kept.append(number)  # noqa: E731
-        return fit_folds(method_class("gp"), data, split, context, keep=keep).scored_on(data, split)
+        return fit_folds(method_class("gp")(), data, split, context, keep=keep).scored_on(data, split)
 
     here = outcome()
     elsewhere("joblib")

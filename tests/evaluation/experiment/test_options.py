@@ -1,7 +1,6 @@
 """Every option is heeded or named: tiny fits of each method on each kind of data, and options perturbed."""
 
-from copy import deepcopy
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -55,7 +54,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             split = split_for(plain(config.split), data)
             folder = Path(mkdtemp())
             fits = fit_folds(
-                partial(deepcopy, method),
+                method,
                 data,
                 split,
                 [context_of(config, run_dir=folder)] * len(split.folds),

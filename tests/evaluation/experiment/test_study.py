@@ -32,7 +32,7 @@ def run(monkeypatch, tmp_path):
         study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
     )
     monkeypatch.setattr(study.checkpoint, "read", kept.get)
-    monkeypatch.setattr(study.loading, "made_again", lambda make, stored: stored)
+    monkeypatch.setattr(study.loading, "made_again", lambda factory, stored: stored)
     context = FitContext(tmp_path, seed=5, budget_s=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 
@@ -132,9 +132,8 @@ def test_more_measurements_are_better_and_are_counted(run):
 def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
     data, split = invent("csi"), divide(48, 3)
     kept = []
-    fits = fit_folds(
-        Nearest, data, split, in_folders(FitContext(tmp_path), split), keep=lambda *given: kept.append(given)
-    )
+    contexts = in_folders(FitContext(tmp_path), split)
+    fits = fit_folds(Nearest(), data, split, contexts, keep=lambda *given: kept.append(given))
     assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
     found = fits.scored_on(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3

@@ -28,7 +28,7 @@ NONE = np.zeros(0, np.int64)
 def fitted(one: Network, count: int, folder: Path, azimuths: bool = True) -> tuple[PerStation, FitReport]:
     """The recommended model of a drive's lists."""
     data = one.data(count, azimuths)
-    method = for_links(Gsparc, data)
+    method = for_links(Gsparc(), data)
     assert isinstance(method, PerStation)
     return method, method.fit(data, Fold(np.arange(len(data)), NONE, NONE), FitContext(folder))
 
