@@ -26,6 +26,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.mixture import residual, solutions
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.named import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation, for_links
@@ -318,7 +319,7 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
     given = []
     initialiser = lambda *args: given.append(args[-1].budget_s) or 1 / 0  # noqa: E731
-    monkeypatch.setattr(solutions, "CANDIDATES", {"powers": initialiser})
+    monkeypatch.setitem(CANDIDATES, "powers", initialiser)
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):

@@ -13,7 +13,7 @@ from scenes import fold_of
 from gsparc.data.splits import SplitSettings
 from gsparc.models import stations
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
@@ -68,7 +68,7 @@ def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkey
     data = heard(30, csi=channels, frequency_hz=np.array(9.2e8))
     fold = fold_of(data)
     fits = []
-    monkeypatch.setattr(NamedMixture, "fit", lambda self, *given: fits.append(given) or 1 / 0)
+    monkeypatch.setattr(Mixture, "fit", lambda self, *given: fits.append(given) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         PerStation(Gsparc()).fit(data, fold, FitContext(tmp_path))
     assert len(fits) == 1 and len(fits[0][0]) == len(data)

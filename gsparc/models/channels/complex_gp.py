@@ -48,7 +48,7 @@ REFINED = 3  # walks to the two lengths
 NAMED = 6  # factors of runs that a note gives
 
 
-class ComplexGP(ClosedForm, kind="aligned"):
+class ComplexGP(ClosedForm):
     """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid.
 
     Where both ends move the covariance is the product of both ends'.

@@ -96,7 +96,7 @@ KERNELS = tuple(GainKernel(c, length, noise) for c in CONSTANTS for length in LE
 REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # during position refinement
 
 
-class DirectionalGP(ClosedForm, kind="rays"):
+class DirectionalGP(ClosedForm):
     """Gaussian process on channels of a moving receiver with measured directions; queries need none.
 
     Args:

@@ -96,6 +96,13 @@ def comparable(values: Tensor, site: Site) -> Tensor:
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
+def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
+    """Return the mean (n, ...) of two predictions in the unit of `comparable`, the other's of this weight."""
+    if site.kind != "rssi":
+        return own.lerp(other, weight)
+    return own.clamp_min(1e-30) ** (1 - weight) * other.clamp_min(1e-30) ** weight
+
+
 def real(values: Tensor) -> Tensor:
     """Entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values

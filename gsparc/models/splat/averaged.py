@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import solutions
+from gsparc.models.mixture.weights import mixed
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import averaged, mean_alone
 from gsparc.models.splat.auto_settings import resolve
@@ -116,9 +118,10 @@ class ImageProcess(LearnedField):
         if self._average_mean is None:
             self._average_mean = mean_alone(self._average[0])
         method, weight = self._average
-        if query.tx.dtype == torch.float64:
-            return replace(own, mean=own.mean.lerp(method.mean_at(query), weight))
-        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(query).mean, weight))
+        exact = query.tx.dtype == torch.float64
+        other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
+        assert self.site is not None
+        return replace(own, mean=mixed(own.mean, other, weight, self.site))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -130,7 +133,10 @@ class ImageProcess(LearnedField):
         twin = copy.copy(self)
         twin._average = None
         result = LearnedField.reduced(twin, settings, measured)
-        return result if self._average is None else averaged(result, *self._average)
+        if self._average is None:
+            return result
+        process, weight = self._average
+        return averaged(result, process, partial(mixed, weight=weight, site=self.site))
 
     def size(self) -> int:
         """Number of Gaussians."""

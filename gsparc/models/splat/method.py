@@ -340,10 +340,10 @@ class LearnedField(Method):
         """The trained model.
 
         Raises:
-            RuntimeError: before `fit` or `restore`.
+            ValueError: before `fit` or `restore`.
         """
         if self.model is None:
-            raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+            raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         return self.model
 
     @property

@@ -175,7 +175,7 @@ def test_seeds_repeat_and_differ(tmp_path):
 
 
 def test_untrained_says_so():
-    with pytest.raises(RuntimeError, match="has not been trained"):
+    with pytest.raises(ValueError, match="has not been trained"):
         LearnedField().fitted()
 
 

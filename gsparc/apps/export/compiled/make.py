@@ -21,7 +21,7 @@ from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
-from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
@@ -102,7 +102,7 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 
 def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
-    if isinstance(method, NamedMixture):
+    if isinstance(method, Mixture):
         return None if method.only is None else exact_form(method.only, site)
     if isinstance(method, Residual):
         return exact_form(method.method, site) if method.rest is None or not method.share else None
