@@ -18,7 +18,7 @@ from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, content
-from gsparc.evaluation.experiment.fit import context_of
+from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Study, facts_of
 from gsparc.evaluation.summary import run_conditions, shown, table, write_samples

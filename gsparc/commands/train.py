@@ -34,14 +34,14 @@ from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.done import State, content, once, program
-from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_of
-from gsparc.models import checkpoint, parts
+from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import build, complete, known
 from gsparc.training import curve, tracking
@@ -148,8 +148,8 @@ def train(
             whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
-                # `Method.fit` of every fold. For gradient steps field/fit.py `run_stage` makes the Trainer
-                # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                # `Method.fit` of every fold. For gradient steps `run_stage` (field/gradient_stage.py) makes
+                # the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(method, data, split, contexts, keep=keep)
                 fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
@@ -206,7 +206,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
     path = None if config.ckpt_path is None else Path(config.ckpt_path)
     if path is None or folds == 1:
         return [path] * folds
-    run = parts.folder_of(path, parts.FOLDS)
+    run = fitting.folder_of(path, fitting.FOLDS)
     every = [run / f"fold{number}" for number in range(folds)]
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
         raise ValueError(
@@ -285,7 +285,7 @@ def _keep(
         log_of_models.info("%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
         context.curve(report.seconds, fitted.name)
-    marks = parts.marks(report, data, split.folds[number], context)
+    marks = fitting.marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
-from gsparc.models import parts
+from gsparc.models.fitting import fit
 from gsparc.models.method import Method
-from gsparc.models.per_station import for_links, trained_stations
+from gsparc.models.per_station import for_stations, trained_stations
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -71,8 +71,8 @@ def baseline(
     methods, seconds = [], []
     for number, fold in enumerate(before.folds):
         known = replace(fold, val=fold.val[:0]) if unseen else fold
-        factory = for_links(method_class(name)(), own)
-        method, report = parts.fit(factory, own, known, FitContext(Path()))
+        factory = for_stations(method_class(name)(), own)
+        method, report = fit(factory, own, known, FitContext(Path()))
         for note in report.notes:
             log.info("fold %d: %s", number, note)
         methods.append(method)

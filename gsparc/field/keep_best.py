@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gsparc.field import edit
-from gsparc.field.fit import KEPT
+from gsparc.field.distributed import agreed
+from gsparc.field.gradient_stage import KEPT
 from gsparc.field.module import GaussianModule
-from gsparc.field.processes import agreed
 
 log = logging.getLogger(__name__)
 

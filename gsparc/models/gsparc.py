@@ -11,12 +11,12 @@ import numpy as np
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Measurements
+from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.method import Method, import_path
-from gsparc.models.mixture.named import Bearings, Channels, ImageSources, Powers
+from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
 from gsparc.models.refined_places import errors_of
-from gsparc.models.splat.averaged import ArrayProcess, ImageProcess
+from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
-from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, called_for
 
 log = logging.getLogger(__name__)

@@ -25,9 +25,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
-from gsparc.models import checkpoint, parts
+from gsparc.models import checkpoint, fitting
+from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions, import_path
-from gsparc.models.parts import common_label
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext, FitReport
@@ -40,7 +40,7 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that statio
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
-def for_links(factory: MethodFactory, data: Measurements) -> MethodFactory:
+def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
     """Return what makes a method of all stations where there are several, else `factory` itself.
 
     Raises:
@@ -125,7 +125,7 @@ class PerStation(Method):
         budget = context.time_budget()
         numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
-        left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
+        left = None if context.resume is None else fitting.folder_of(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
@@ -145,14 +145,14 @@ class PerStation(Method):
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before = budget.counted.wall
             try:
-                copy, report = parts.fit(self.factory, part, inner, own)
+                copy, report = fitting.fit(self.factory, part, inner, own)
             except KeyboardInterrupt:
                 if not resumable or len(numbers) == 1:
                     raise
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = parts.marks(report, part, inner, own)
+                extra = fitting.marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf, open_dict
 import gsparc.conf
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
-from gsparc.field.fit import DEFAULTS
+from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, methods
 

@@ -35,8 +35,8 @@ from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.fitting import Origin
 from gsparc.models.loading import module_of
-from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
 from gsparc.training import curve
 from gsparc.training.context import FitContext

@@ -7,7 +7,7 @@ from kinds import moving_array, static_array
 from watchdog import watched
 
 from gsparc.data.load import load, split_for
-from gsparc.evaluation.experiment.fit import context_of
+from gsparc.evaluation.experiment.folds import context_of
 from gsparc.models.registry import build
 
 LONGEST_S = 2.0  # of the thread's own processor time: a busy machine does not lengthen it

@@ -11,7 +11,7 @@ from gsparc.callbacks import Checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.fit import DEFAULTS
+from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import Method
 from gsparc.models.registry import build
 from gsparc.training.context import FitContext

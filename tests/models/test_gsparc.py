@@ -21,17 +21,17 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, loading, parts
+from gsparc.models import checkpoint, fitting, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
-from gsparc.models.mixture import residual, solutions
+from gsparc.models.mixture import fit_candidates, residual
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import CANDIDATES
-from gsparc.models.mixture.named import Powers
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.mixture.residual import Residual
-from gsparc.models.per_station import PerStation, for_links
+from gsparc.models.per_station import PerStation, for_stations
 from gsparc.models.registry import build, method_class
-from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.image_process import ImageProcess
 from gsparc.ops import Pose
 from gsparc.training import race
 from gsparc.training.context import FitContext, FitReport
@@ -85,7 +85,7 @@ def fit(
     try:
         context = short(folder, steps, validate_every=4, budget_s=seconds, budget_clock="processor", **more)
         began = time.process_time()
-        method, report = parts.fit(for_links(build(config.model), data), data, fold, context)
+        method, report = fitting.fit(for_stations(build(config.model), data), data, fold, context)
         spent = (time.process_time() - began) / torch.get_num_threads()
     finally:
         logger.removeHandler(kept)
@@ -218,7 +218,7 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(residual, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(race, "HOPELESS", math.inf)
-    monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
+    monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
     field = fitted.method
@@ -323,7 +323,7 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):
-        parts.fit(Gsparc(), data, fold, short(tmp_path, 10, budget_s=5.0))
+        fitting.fit(Gsparc(), data, fold, short(tmp_path, 10, budget_s=5.0))
     assert len(given) == 1 and 4 < given[0] < 5
 
 
@@ -331,4 +331,4 @@ def test_weights_to_start_from_were_ignored_in_closed_form(tmp_path):
     data = KINDS["powers"](tmp_path)
     context = FitContext(init_from=tmp_path / "model.ckpt")
     with pytest.raises(ValueError, match="init_from: gsparc takes no weights to start from here"):
-        parts.fit(Gsparc(), data, fold_of(data), context)
+        fitting.fit(Gsparc(), data, fold_of(data), context)

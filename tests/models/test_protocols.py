@@ -33,7 +33,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import build, method_class, methods
 from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
@@ -239,7 +239,7 @@ def test_what_is_scored_is_what_is_served(name):
 def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     data = kinds.several(tmp_path)
     fold = fold_of(data)
-    method = for_links(method_class(name)(), data)
+    method = for_stations(method_class(name)(), data)
     method.fit(data, fold, FitContext(tmp_path, stations=how))
     predictor = Predictor(method, data.site)
     for number in range(len(kinds.POSTS)):

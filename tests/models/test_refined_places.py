@@ -16,9 +16,9 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
-from gsparc.models import parts
+from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.refined_places import Linearised, displaced, displacements, refined
 from gsparc.training.context import FitContext
 
@@ -96,7 +96,7 @@ def _missed(method, exact, fold):
 
 
 def _fitted(data, fold, **settings):
-    return parts.fit(Gsparc(**settings), data, fold, BRIEF)
+    return fitting.fit(Gsparc(**settings), data, fold, BRIEF)
 
 
 def test_known_errors_of_places_cost_less_than_unknown_ones():
@@ -128,7 +128,7 @@ def test_exact_places_stay_though_errors_are_claimed():
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
-    _, report = parts.fit(for_links(Gsparc(position_std=0.05), data), data, fold, BRIEF)
+    _, report = fitting.fit(for_stations(Gsparc(position_std=0.05), data), data, fold, BRIEF)
     assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
 
 

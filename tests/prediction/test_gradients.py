@@ -29,11 +29,11 @@ from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, Prediction
-from gsparc.models.mixture.named import Powers
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -175,7 +175,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             for module in (gp, complex_gp, powers):
                 patch.setattr(module, "MOST_ROWS", 30)
             patch.setattr(complex_gp, "NEAREST", 20)
-        method = for_links(case.make(), data).made_for(data)
+        method = for_stations(case.make(), data).made_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
         budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))

@@ -22,9 +22,9 @@ from gsparc.apps.locate.snapshots import Snapshots, snapshots
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import parts
+from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ def trusted(
     inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
     for number, inner in enumerate(inner_folds):
         log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
-        method, _ = parts.fit(for_links(factory, data), data, inner, context.within(f"group{number}"))
+        method, _ = fitting.fit(for_stations(factory, data), data, inner, context.within(f"group{number}"))
         rows = np.union1d(inner.train, inner.val)
         without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)

@@ -18,9 +18,9 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models import checkpoint, parts
+from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory, Reconditions, predictions
-from gsparc.models.per_station import PerStation, for_links, trained_stations
+from gsparc.models.per_station import PerStation, for_stations, trained_stations
 from gsparc.training.context import FitContext
 
 KEY = "map"
@@ -149,7 +149,7 @@ def without(
             return refit
     with tempfile.TemporaryDirectory() as folder:
         own = replace(context, run_dir=Path(folder))
-        return parts.fit(for_links(factory, data), data, fold, own)[0]
+        return fitting.fit(for_stations(factory, data), data, fold, own)[0]
 
 
 def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:

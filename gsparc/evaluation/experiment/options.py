@@ -18,8 +18,8 @@ from gsparc.data.instantiate import find
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.evaluation.console import config_folder
+from gsparc.models.fitting import leaves
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.parts import leaves
 
 log = logging.getLogger(__name__)
 

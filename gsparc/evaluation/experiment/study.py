@@ -17,7 +17,7 @@ from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, once
-from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading

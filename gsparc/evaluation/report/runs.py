@@ -18,7 +18,7 @@ from gsparc.data.schema import Kind
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import read_summary, write_samples
-from gsparc.models.parts import leaves
+from gsparc.models.fitting import leaves
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 

@@ -25,15 +25,15 @@ from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
+from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, Reducible
-from gsparc.models.mixture import solutions
+from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.reduced import ReducedByPart
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
-from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
@@ -161,9 +161,11 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
-        cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
-        found, reports, read = solutions.find(parts, init, self.switches, data, fold, context, budget, cut)
-        chosen = solutions.weighed(found, data, fold, cut)
+        cut = cut_inside(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
+        found, reports, read = fit_candidates.fit_all(
+            parts, init, self.switches, data, fold, context, budget, cut
+        )
+        chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
         heeded.count(*(path for name in chosen for path in read[name]))
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)

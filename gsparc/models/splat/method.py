@@ -25,9 +25,9 @@ from gsparc.field import edit
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel, fit_errors
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
-from gsparc.field.fit import run_stage, steps_asked_for
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
+from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
@@ -35,15 +35,15 @@ from gsparc.field.module import GaussianModule, LossSettings, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
+from gsparc.models.fitting import Origin
 from gsparc.models.in_double import in_double
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.weights import LEAST_HELD
-from gsparc.models.parts import Origin
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, resolve, settled
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.models.splat.closed_form import prepare
+from gsparc.models.splat.closed_form_start import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable

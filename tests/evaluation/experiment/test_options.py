@@ -18,7 +18,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.fit import context_of, fit_folds
+from gsparc.evaluation.experiment.folds import context_of, fit_folds
 from gsparc.models.registry import build, complete
 
 WORLDS = {

@@ -10,7 +10,7 @@ from invented import divide, invent
 from gsparc.data.query import Batch
 from gsparc.evaluation.experiment import study
 from gsparc.evaluation.experiment.done import State
-from gsparc.evaluation.experiment.fit import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, in_folders
 from gsparc.evaluation.experiment.study import Measured, Positions, Study, facts_of
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean

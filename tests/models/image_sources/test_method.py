@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import box_of, gather, scatterers
-from gsparc.models.mixture.named import ImageSources
+from gsparc.models.mixture.methods import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 from gsparc.training.race import Behind, Race

@@ -25,7 +25,7 @@ from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
-from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor

@@ -44,10 +44,10 @@ class LearnsTogether(MethodFactory):
         """See `Method.best_stations`."""
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
-        return best(data, fold, context)
+        return decide(data, fold, context)
 
 
-def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
+def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
     """How stations of a site that can be learned as one are best learned, and why.
 
     Channels share waves and where their stations really stand: together. Powers share little more than a

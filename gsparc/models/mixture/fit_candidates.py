@@ -41,7 +41,7 @@ CLUTTERED = ("sources", "scene", "joint_powers")  # candidates to which `clutter
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
-def find(
+def fit_all(
     parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
     fold: Fold, context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
 ) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
@@ -129,7 +129,7 @@ def _reached(race: Race | None) -> str | None:
     return f"another solution misses {race.error:.4f} of the energy of rows held out"
 
 
-def weighed(
+def weigh_candidates(
     solutions: dict[str, ClosedForm], data: Measurements, fold: Fold, cut: InnerFolds | None
 ) -> dict[str, tuple[ClosedForm, float]]:
     """Solutions with their weights where positive, by rows which they were not conditioned on.
@@ -193,7 +193,7 @@ def _held(
     return LeftOutRows(np.concatenate(groups), mean, variance)
 
 
-def weigh(
+def weigh_process(
     field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
 ) -> tuple[tuple[GaussianProcess, float] | None, float | None]:
     """What a plain process on whole targets is worth next to a field, on rows that neither learned from.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.evaluation.experiment.fit import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, in_folders
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 

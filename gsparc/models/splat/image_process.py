@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture import solutions
+from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.weights import mixed
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import averaged, mean_alone
@@ -103,7 +103,8 @@ class ImageProcess(LearnedField):
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         if self.plain:
-            self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
+            left = self._left_out, self._apart
+            self._average, explained = fit_candidates.weigh_process(self, data, fold, *left)
             self.explained = self.explained if explained is None else explained
 
     # -- answering ---------------------------------------------------------------------------------

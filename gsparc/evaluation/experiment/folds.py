@@ -20,9 +20,9 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.scores import score
-from gsparc.models import parts
+from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, less_repeatable
@@ -122,7 +122,7 @@ def fit_folds(
         fold = split.folds[number]
         there, rows = (data, fold) if learned is None else learned(data, fold)
         before = time.process_time()
-        method, report = parts.fit(for_links(factory, there), there, rows, contexts[number])
+        method, report = fitting.fit(for_stations(factory, there), there, rows, contexts[number])
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}

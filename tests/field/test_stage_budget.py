@@ -9,7 +9,7 @@ from clocks import wound
 from contexts import loaded, short
 
 from gsparc.commands.train import train
-from gsparc.field.pace import Budget
+from gsparc.field.stage_budget import Budget
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting

@@ -11,7 +11,7 @@ from posts import POSTS, heard
 from scenes import fold_of
 
 from gsparc.data import executor
-from gsparc.models import checkpoint, parts
+from gsparc.models import checkpoint, fitting
 from gsparc.models.baselines.nearest import Nearest
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.training.context import FitContext
@@ -83,8 +83,12 @@ def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     context = FitContext(tmp_path / "fold0", stations="each")
     method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
-    checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=parts.marks(report, data, fold, context))
-    again, found = parts.fit(PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0"))
+    checkpoint.save(
+        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.marks(report, data, fold, context)
+    )
+    again, found = fitting.fit(
+        PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")
+    )
     assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
 
 
@@ -107,7 +111,7 @@ def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
 def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
     (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
-    assert parts.folder_of(tmp_path / given, parts.FOLDS) == tmp_path / found
+    assert fitting.folder_of(tmp_path / given, fitting.FOLDS) == tmp_path / found
 
 
 @pytest.mark.parametrize(
@@ -120,4 +124,4 @@ def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     ],
 )
 def test_several_fits_are_named_by_what_most_say(labels, found):
-    assert parts.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found
+    assert fitting.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found
