@@ -24,7 +24,7 @@ from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import with_common_phase
 from gsparc.models.checkpoint import Stored
-from gsparc.models.method import Method, MethodFactory, TrainsByGradient
+from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import TimeBudget
@@ -77,7 +77,7 @@ def fit(
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
     method = factory.made_for(data)
-    if context.init_from is not None and not (method.has_parts or isinstance(method, TrainsByGradient)):
+    if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
     report = method.fit(data, fold, context)

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from hydra.utils import get_class
 
 from gsparc.field.module import GaussianModule
 from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.method import Method, MethodFactory, TrainsByGradient, import_path
+from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import build, known
-
-
-@runtime_checkable
-class HasModule(TrainsByGradient, Protocol):
-    """Trains a Gaussian field, and is one where `trainer_options()` says so."""
-
-    def module(self) -> GaussianModule:
-        """What Lightning trains, with schedules one step long."""
+from gsparc.models.splat.method import LearnedField
 
 
 def restore(stored: checkpoint.Stored) -> Method:
@@ -76,6 +68,6 @@ def module_of(path: str | Path) -> GaussianModule:
         CheckpointError: unreadable, or another method's.
     """
     method, stored = load(path)
-    if not (isinstance(method, HasModule) and method.trainer_options()):
+    if not isinstance(method, LearnedField):
         raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
     return method.module()

@@ -75,6 +75,7 @@ class MethodFactory(ABC):
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_parts = False  # whether it resumes parts in folders of their own
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+    takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
 
     @abstractmethod
     def made_for(self, data: Measurements) -> Method:
@@ -306,11 +307,3 @@ class Reducible(Protocol):
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """A method that answers with these settings; this one is left as it is."""
-
-
-@runtime_checkable
-class TrainsByGradient(Protocol):
-    """Trains under a Lightning Trainer and heeds its options."""
-
-    def trainer_options(self) -> bool:
-        """Whether it does with its present settings; known before `fit` or settled by it."""

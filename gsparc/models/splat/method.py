@@ -29,7 +29,7 @@ from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import InitSettings, InitTask
-from gsparc.field.keep_best import KeepBest, StopAt
+from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.module import GaussianModule, LossSettings, squared_error
 from gsparc.field.optimizer import OptimizerSettings
@@ -74,7 +74,7 @@ class LearnedField(Method):
     effects = "image"
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
-    takes_budget = True
+    takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
@@ -161,7 +161,10 @@ class LearnedField(Method):
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
-                seconds += self._stage("train", origin, data, watched, context, budget, seconds, steps)
+                # Steps that somebody asks for are all taken.
+                patience = PATIENCE if asked is None else None
+                known = origin, data, watched, context, budget, seconds, steps
+                seconds += self._stage("train", *known, patience=patience)
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
@@ -178,7 +181,7 @@ class LearnedField(Method):
             again = context.within("refit", resume=resume)
             known = self.fitted().confidence, self.fitted().error
             kept = self.model, self.steps, self._prior
-            self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
+            self._stage("refit", origin, data, every, again, budget, seconds, steps, None, *known)
             if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
         return self._ended(context, budget)
@@ -207,7 +210,7 @@ class LearnedField(Method):
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, earlier_s: float, steps: int,
+        budget: TimeBudget, earlier_s: float, steps: int, patience: int | None = None,
         confidence: Confidence | None = None, error: ErrorModel | None = None,
     ) -> float:  # fmt: skip
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
@@ -215,6 +218,7 @@ class LearnedField(Method):
         Args:
             stage: `train`, `refit` or `final`, which takes no steps.
             steps: of the schedule.
+            patience: see `KeepBest`.
             confidence, error: of an earlier stage, told by rows that this one learns from.
         """
         folder, resume = context.run_dir, context.resume
@@ -269,7 +273,7 @@ class LearnedField(Method):
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         watch: list[L.Callback] = []
         if self.keep_best and stage == "train":
-            watch.append(KeepBest())
+            watch.append(KeepBest(patience))
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
         heeded.count("dataset.batch_size")
@@ -412,10 +416,6 @@ class LearnedField(Method):
         return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
-
-    def trainer_options(self) -> bool:
-        """See `TrainsByGradient`."""
-        return True
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
