@@ -59,6 +59,14 @@ def test_stations_were_mixed_up_and_done_again_by_a_resumed_run(town, tmp_path, 
     assert len(list((tmp_path / "on").glob("station*/model.ckpt"))) == 3  # it can be gone on from, too
 
 
+def test_a_folder_of_stations_that_were_finished_was_not_gone_on_from(town, tmp_path):
+    """Of a run's folder only its own `last.ckpt` was taken, which stations have in folders of their own."""
+    fitted(town, tmp_path / "run")
+    Resumable.fits = 0
+    fitting.fit(PerStation(Resumable()), *town, FitContext(tmp_path / "on", resume=tmp_path / "run"))
+    assert Resumable.fits == 0
+
+
 def test_a_part_is_not_taken_for_another(town, tmp_path):
     data = town[0]
     fitted(town, tmp_path / "run")

@@ -21,7 +21,8 @@ from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.experiment.folds import fit_folds, in_folders
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint, loading
-from gsparc.models.per_station import PerStation, for_stations, of_station
+from gsparc.models.fitting import fit
+from gsparc.models.per_station import PerStation, for_stations, of_station, trained_stations
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
@@ -143,6 +144,16 @@ def test_a_station_that_heard_nothing_ended_the_run():
     fold = fold_of(data)
     for name in ("nearest", "kriging", "gp"):
         assert fitted(name, data, fold).predict(data.batch(fold.test)).mean.isfinite().all()
+
+
+def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
+    """It learns from them, as the processes do that it is compared with, of which a station had none."""
+    data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
+    for name in ("gsparc", "powers", "gp"):
+        assert trained_stations(method_class(name)(), data, fold_of(data))[0].all()
+    context = FitContext(stations="each", effort=0.1)
+    method, _ = fit(for_stations(method_class("gsparc")(), data), data, fold_of(data), context)
+    assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()
 
 
 def test_sectors_of_one_mast_were_answered_by_the_first():

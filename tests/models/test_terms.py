@@ -51,6 +51,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         ("csi", {"count": 0}, ("diffuse",)),
         ("csi", {"effects": {"residual": False}}, ("sources",)),
         ("csi", {"init": "rays"}, ("rays", "diffuse")),
+        ("csi", {"init": "diffuse"}, ("diffuse",)),  # was weighed against itself
         ("csi", {"init": "scene"}, ("scene", "diffuse")),
         ("csi", {"hidden": 8}, ()),  # an ablation of networks is not answered by another model
         ("csi", {"init": "uniform"}, ()),
