@@ -67,7 +67,8 @@ class LearnedField(Method):
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best look at validation rows, the start among them.
         steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60 after a
-            start in closed form, else 400. 0 of either is the start alone.
+            start in closed form, else 400, fewer where the first looks show no gain (`KeepBest`). 0 of
+            either is the start alone.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
