@@ -6,6 +6,8 @@ accuracy under its own name, seconds of training, milliseconds of a query and th
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -27,15 +29,15 @@ from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
-def variants_of(config: DictConfig) -> dict[str, MethodFactory]:
+def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
     """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
 
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
     variants = {
-        str(name): build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+        str(name): partial(build, OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
         for name, overrides in plain(config.variants).items()
     }
-    return variants | {name: method_class(name)() for name in config.baselines}
+    return variants | {name: method_class(name) for name in config.baselines}
 
 
 def study_of(config: DictConfig) -> Study:

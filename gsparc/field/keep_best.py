@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 SURE = 2.0  # standard errors of paired rows by which a look must be better than the start
 # Looks without one that is, after which steps that nobody asked for end. Of 15 fits (spectra of rfid by two
-# ways and splits, simulated spectra, moving receivers, channels, powers) whatever gained did so by the second.
+# ways and splits, simulated spectra, moving receivers, channels, powers) what gained did so by the second.
 PATIENCE = 3
 
 

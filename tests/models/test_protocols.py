@@ -54,8 +54,8 @@ DECLARED = {
     "splat": "Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
-    **dict.fromkeys(("array_process", "image_process"), "Reducible"),
-    **dict.fromkeys(("gsparc", "image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
+    **dict.fromkeys(("array_process", "image_process", "gsparc"), "Reducible"),  # gsparc of spectra
+    **dict.fromkeys(("image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
 }
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -110,7 +110,7 @@ class Study:
     """What is compared.
 
     Attributes:
-        variants: what makes their methods, by name, in the order of the table.
+        variants: what makes a method, or what chooses it, by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
         base: name of the variant that times are compared with; None: no ratios.
         rounds: trainings of each, in turns; round r uses seed + r.
@@ -118,7 +118,7 @@ class Study:
         clock: of the queries.
     """
 
-    variants: Mapping[str, MethodFactory]
+    variants: Mapping[str, Callable[[], MethodFactory]]
     conditions: Sequence[Condition] = (Condition(),)
     base: str | None = None
     rounds: int = 1
@@ -192,7 +192,7 @@ class Study:
                     replace(context, run_dir=learned.model(folder).parent, seed=seed), split
                 )
                 learned_from = partial(learned.learned_from, seed=seed)
-                made = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
+                made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
                 fits[learned] = made.scored_on(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
                 # Without the configuration of the study: a variant has other settings.
@@ -223,7 +223,7 @@ class Study:
         rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         methods = {
-            file: loading.made_again(self.variants[variant], checkpoint.read(file))
+            file: loading.made_again(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from clocks import WoundClock
@@ -42,10 +44,11 @@ class Slow(Nearest):
 
     effects = "sleep"
     seconds, query_s = 3.0, 0.004
+    contexts: ClassVar[list] = []
 
     def fit(self, data, fold, context):
         super().fit(data, fold, context)
-        self.context = context
+        self.contexts.append(context)
         return FitReport(self.seconds)
 
     def predict(self, query):
@@ -93,16 +96,12 @@ def test_the_base_must_be_there(run):
 
 
 def test_every_fit_gets_the_context_and_every_round_another_seed_once(run):
-    found = []
-
-    def make():
-        found.append(Quick())
-        return found[-1]
-
+    Quick.contexts.clear()
     for _ in range(2):  # the second time every round is done
-        run(Study(dict(quick=make), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
-    assert [m.context.seed for m in found] == [3, 3, 4, 4] and {m.context.budget_s for m in found} == {7.0}
-    assert len({m.context.run_dir for m in found}) == 4
+        run(Study(dict(quick=Quick), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
+    assert [one.seed for one in Quick.contexts] == [3, 3, 4, 4]
+    assert {one.budget_s for one in Quick.contexts} == {7.0}
+    assert len({one.run_dir for one in Quick.contexts}) == 4
 
 
 def test_errors_cost_an_interpolator_and_not_the_mean(run):
