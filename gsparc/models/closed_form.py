@@ -80,7 +80,7 @@ class ClosedForm(Method):
 
 def stored(method: ClosedForm) -> dict[str, Any]:
     """What `restored` reads."""
-    return {"target": import_path(type(method)), "state": method.state()}
+    return {"target": import_path(method.stored_as), "state": method.state()}
 
 
 def restored(site: Site, state: dict[str, Any]) -> ClosedForm:

@@ -63,6 +63,11 @@ class KnownWallsGP(ImageSourceGP):
         if self.clutter:
             self.settings = replace(self.settings, visibility=KERNEL)
 
+    @property
+    def stored_as(self) -> type[ImageSourceGP]:
+        """See `Method`; what was found needs no walls to answer."""
+        return ImageSourceGP
+
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
         cache: SearchCache, look: Look | None = None,
