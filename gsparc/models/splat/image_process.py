@@ -136,6 +136,7 @@ class ImageProcess(LearnedField):
         result = LearnedField.reduced(twin, settings, measured)
         if self._average is None:
             return result
+        assert self.site is not None
         process, weight = self._average
         return averaged(result, process, partial(mixed, weight=weight, site=self.site))
 

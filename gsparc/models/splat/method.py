@@ -164,8 +164,9 @@ class LearnedField(Method):
             if steps and watching:
                 # Steps that somebody asks for are all taken.
                 patience = PATIENCE if asked is None else None
-                known = origin, data, watched, context, budget, seconds, steps
-                seconds += self._stage("train", *known, patience=patience)
+                seconds += self._stage(
+                    "train", origin, data, watched, context, budget, seconds, steps, patience
+                )
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
