@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
+FIELDS = "<!-- optional arrays of gsparc/data/fields.csv -->"
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 
@@ -25,9 +27,18 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **unused: Any) -> str:
-    """Links to the README lead to the start page, those to taken pages to these."""
+    """Links to the README lead to the start page, those to taken pages to these; a marker becomes a table."""
+    markdown = markdown.replace(FIELDS, optional_fields())
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
+
+
+def optional_fields() -> str:
+    """Return the rows of the schema that a file need not hold, as a table in Markdown."""
+    with (ROOT / "gsparc" / "data" / "fields.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    shown = [(f"`{name}`", *rest) for name, *rest in rows if rest[head.index("required") - 1] == "no"]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *shown))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

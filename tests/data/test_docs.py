@@ -1,8 +1,10 @@
 """docs/own-data.md is what a new user reads: its example runs; docs/reference/schema.md is the schema."""
 
 import re
+import runpy
 from pathlib import Path
 
+import pytest
 from doors import knock
 
 from gsparc.commands.check import main as check
@@ -13,8 +15,13 @@ PAGE = (DOCS / "own-data.md").read_text(encoding="utf-8")
 SCHEMA = (DOCS / "reference" / "schema.md").read_text(encoding="utf-8")
 
 
-def test_the_table_is_the_schema():
-    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", SCHEMA, flags=re.MULTILINE)
+def test_the_tables_are_the_schema():
+    """What a file must hold stands on the page, the rest where the site puts it."""
+    pytest.importorskip("mkdocs", reason="the site's tables need the extra docs")
+    hook = runpy.run_path(str(DOCS / "site" / "pages.py"))
+    assert hook["FIELDS"] in SCHEMA
+    page = SCHEMA.replace(hook["FIELDS"], hook["optional_fields"]())
+    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", page, flags=re.MULTILINE)
     documented = {name: (shape, unit, required, meaning) for name, shape, unit, required, meaning in rows}
     assert documented == {f.name: (f.shape, f.unit, f.required, f.meaning) for f in FIELDS.values()}
 
