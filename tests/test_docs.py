@@ -52,6 +52,8 @@ def test_what_a_page_names_is_there(page):
     links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
     files, anchors = zip(*(link.partition("#")[::2] for link in links), strict=True) if links else ((), ())
     missing = [file for file in files if not (page.parent / file).exists()]
+    shown_tables = re.findall(r"<!-- table: (\S+) -->", text)
+    missing += [path for path in shown_tables if not (ROOT / path).exists()]
     rooms = r"(?:gsparc|ops|callbacks|conf|bench|tests|docs)"
     paths = re.findall(rf"`({rooms}/[\w./-]+(?:\.\w+|/))`", text)
     missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]

@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
-FIELDS = "<!-- optional arrays of gsparc/data/fields.csv -->"
+TABLE = re.compile(r"^<!-- table: (\S+\.csv) -->$", re.MULTILINE)  # its path from the root
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 
@@ -27,17 +27,17 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **unused: Any) -> str:
-    """Links to the README lead to the start page, those to taken pages to these; a marker becomes a table."""
-    markdown = markdown.replace(FIELDS, optional_fields())
+    """Links to the README lead to the start page, those to taken pages to these; tables are shown."""
+    markdown = TABLE.sub(lambda found: table(ROOT / found[1]), markdown)
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
 
 
-def optional_fields() -> str:
-    """Return the rows of the schema that a file need not hold, as a table in Markdown."""
-    with (ROOT / "gsparc" / "data" / "fields.csv").open(encoding="utf-8", newline="") as file:
+def table(path: Path) -> str:
+    """Return a CSV file as a table in Markdown, names in its first column as code."""
+    with path.open(encoding="utf-8", newline="") as file:
         head, *rows = csv.reader(file)
-    shown = [(f"`{name}`", *rest) for name, *rest in rows if rest[head.index("required") - 1] == "no"]
+    shown = [(re.sub(r"^\w+$", r"`\g<0>`", name), *rest) for name, *rest in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *shown))
 
 
