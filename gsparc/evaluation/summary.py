@@ -140,9 +140,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Remarks on a table: rows that are not unseen, stand-ins, a busy machine, a baseline that is better."""
     seen = {
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
-        "val": [
-            "methods, but not baselines, used these validation rows: compare methods with eval_on=test"
-        ],
+        "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     cost = [f"cost: {facts['time/cost']}"] if facts.get("time/cost") else []
@@ -170,7 +168,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
         repeat = "fixed steps or searches repeat exactly"
         if facts["model/limited_by_clock"] == "wall":
             repeat = f"budget_clock=processor does not count what others do, {repeat}"
-        conditions.append(f"the time limit ended the training, so the result depends on this machine: {repeat}")
+        conditions.append(f"the time limit ended training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
         conditions.append(
