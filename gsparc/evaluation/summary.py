@@ -159,7 +159,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         conditions.append(
-            f"SIMULATED stand-in: the {release} release was not found; these figures are not of it"
+            f"SIMULATED stand-in: the {release} release was not found; these figures do not describe it"
         )
     if facts.get("split/unseen_runs"):
         count = facts["split/unseen_runs"]
