@@ -125,7 +125,7 @@ def test_a_search_far_behind_another_solution_ends(tmp_path):
     group, looks = fold.train[::3], []
     target = data.batch(group).target
     race = Race.of(group, 1.0001 * target, target, lambda what, error: looks.append((what, error)))
-    with pytest.raises(Behind, match="on held-out rows"):
+    with pytest.raises(Behind, match="of the energy of rows held out"):
         method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=race))
     assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
 
