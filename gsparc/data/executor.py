@@ -177,7 +177,7 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                 lost.update(list(begun))
                 if max(lost.values(), default=TRIES) >= TRIES:
                     raise
-                log.warning("begun again: what a process did that died (%s)", reason(error).split(". ")[0])
+                log.warning("a process died, its work starts again (%s)", reason(error).split(". ")[0])
 
 
 def _ray() -> Any:

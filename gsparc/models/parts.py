@@ -168,7 +168,7 @@ class Origin:
             )
         changed = _differences(before, now, CHANGEABLE)
         if changed:
-            log.warning("going on from %s, which had %s", stored.path, some(changed))
+            log.warning("continuing from %s, which had %s", stored.path, some(changed))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:
