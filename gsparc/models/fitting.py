@@ -66,7 +66,7 @@ def fit(
             start from (`init_from`), and the method has none.
     """
     budget = TimeBudget()
-    data, left = with_common_phase(data, fold), context.resume
+    (data, rows), left = with_common_phase(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count("*")
@@ -80,7 +80,7 @@ def fit(
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
-    report = method.fit(data, fold, context)
+    report = method.fit(data, rows, context)
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)
@@ -183,7 +183,7 @@ class Origin:
             )
         changed = _differences(before, now, CHANGEABLE)
         if changed:
-            log.warning("going on from %s, which had %s", stored.path, some(changed))
+            log.warning("continuing from %s, which had %s", stored.path, some(changed))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:

@@ -333,7 +333,7 @@ def test_models_without_gradients_say_so(name, tmp_path):
     rendered = name == "gsparc"  # of a moving receiver
     data = images(tmp_path, 40, "rx") if rendered else kinds.received(tmp_path)
     more = (*RENDERED, "model.field.count=10", "model.keep_best=false")
-    method = planned(*more)() if rendered else method_class(name)()
+    method = (planned(*more) if rendered else method_class(name))().made_for(data)
     method.fit(data, make_split(data.moving, SplitSettings()).folds[0], short(tmp_path, 2))
     with pytest.raises(ValueError, match=f"{name} has no gradients by position: .*{REFUSED[name]}"):
         getattr(Predictor(method, data.site), data.site.kind)(rx=torch.zeros(3), grad=True)
