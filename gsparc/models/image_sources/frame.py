@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.rows import Rows, query_elements, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
@@ -82,13 +83,6 @@ class Frame:
         variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
         return Prediction(mean, variance * self.scale**2, (variance / prior).clamp(0, 1), mean)
 
-    def paths(self, gain: Tensor, away: Tensor, towards: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `ImageSourceGP.paths`; of gains (B E, R, N), ranges (B E, N) [m], offsets (B, N, 3) [m]."""
-        count = len(towards)
-        gain = (gain * self.scale).reshape(count, self.antennas, -1)
-        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), self.carrier_hz
-
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
@@ -104,6 +98,60 @@ class Frame:
     def read(site: Site, state: dict[str, Any]) -> tuple[Frame, Rows]:
         """Inverse of `state`."""
         return Frame(site, int(state["antennas"]), *state["frame"]), Rows(*state["rows"])
+
+
+class SourcesInFrame(ClosedForm):
+    """Channels as sums of sources that a search proposes.
+
+    Attributes:
+        frame: of the fit.
+        factors: (A,) complex64, what each antenna's channels were multiplied by before the fit; (1,) of all.
+    """
+
+    frame: Frame
+    factors = torch.ones(1, dtype=torch.complex64)
+
+    @abstractmethod
+    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
+
+        Normalised; the prior is the power that is expected without any rows.
+        """
+
+    @abstractmethod
+    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gains (m, R, N) at the carrier, normalised, ranges (m, N) and sources (N, 3) [m]."""
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`.
+
+        The variance is of gains, noise, visibility and between searches; the confidence is the explained
+        share of the expected power.
+        """
+        (places, _), tones = self._fitted().places(query), torch.from_numpy(self.frame.site.tones())
+        mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
+        return self.frame.prediction(self.frame.stored(mean, tones) / self.factors[:, None], variance, prior)
+
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+        """The paths that `predict` sums, one per source: of several searches, with the search's weight.
+
+        Returns:
+            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
+            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
+            the carrier [Hz].
+        """
+        frame, (places, count) = self.frame, self._fitted().places(query)
+        gain, away, sources = self._paths(places)
+        gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
+        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
+        towards = sources - places[:, :3].reshape(count, -1, 3).mean(1)[:, None]
+        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, unit, frame.carrier_hz
+
+    def _fitted(self) -> Frame:
+        if self.site is None or not self.size():
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.frame
 
 
 def refuse(site: Site, name: str) -> None:

@@ -50,6 +50,11 @@ class Scene:
     quadrature: float = 1.0
     noise_floor: float = JITTER
 
+    @staticmethod
+    def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
+        """The static end (3,) [m] alone, of log amplitude (1,)."""
+        return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
+
     @cached_property
     def sources(self) -> Tensor:
         """Positions (K, 3) float64 [m]."""

@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import get_args
 
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
 from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.phase_offsets import Offsets
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.reflection_orders import (
     drop_planes,
@@ -30,6 +33,7 @@ from gsparc.processes.worker import late
 
 log = logging.getLogger(__name__)
 
+NOISE = 0.1  # variance at the start, of unit signal power
 PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
@@ -40,24 +44,32 @@ LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths ar
 
 
 @dataclass(frozen=True)
-class SearchSettings:
-    """How far a search goes, and what it starts from.
+class SearchSettings(Checked):
+    """What is searched for, on which rows, and how far.
 
     Attributes:
+        searches: how many, with different seeds; their predictions are averaged.
+        search_rows: receivers times tones of a search.
+        rows: receivers times tones of the final process.
         margin: of the search box around receivers and transmitter [m].
-        order: largest reflection order of a source.
         max_sources: that end the search.
+        order: largest reflection order of a source.
+        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
+        clutter: search for occluding boxes and finite mirrors, shared by all sources.
+        seed: of everything random in the first search; the others count on.
         final_steps: of refinement at the end.
-        noise: variance at the start, of unit signal power.
-        visibility: initial kernel and centre of its prior.
     """
 
-    margin: float = 8.0
-    order: int = 3
-    max_sources: int = 60
+    searches: int = setting(6, whole(1))
+    search_rows: int = setting(700, whole(8))
+    rows: int = setting(3000, whole(8))
+    margin: float = setting(8.0, POSITIVE)
+    max_sources: int = setting(60, whole(1))
+    order: int = setting(3, whole(0))
+    offsets: Offsets = setting("none", choice(*get_args(Offsets)))
+    clutter: bool = setting(True, switch())
+    seed: int = 0
     final_steps: int = 80
-    noise: float = 0.1
-    visibility: KernelVisibility = field(default_factory=KernelVisibility)
 
 
 class Search:
@@ -67,23 +79,20 @@ class Search:
         rows: a few hundred.
         transmitter: (3,) float64 [m].
         settings: how.
-        seed: of the candidates.
+        number: of the search, added to the seed of the candidates.
         last_round: asked after every round; no other starts when it says so.
     """
 
     def __init__(
-        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
+        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
         last_round: Callable[[], bool],
     ) -> None:  # fmt: skip
         self.rows, self.settings, self.last_round = rows, settings, last_round
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
-        self.scene = Scene(
-            transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),),
-            direct_amplitude(rows, transmitter).log().reshape(1), math.log(settings.noise),
-            settings.visibility,
-        )  # fmt: skip
+        loudness = direct_amplitude(rows, transmitter).log().reshape(1)
+        self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
@@ -135,7 +144,7 @@ class Search:
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
+            self.scene = learn_visibility(few, self.scene, steps, KernelVisibility())
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""

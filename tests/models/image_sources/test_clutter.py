@@ -11,7 +11,7 @@ from gains import gains, phased
 from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
-from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles, tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box
 from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch, walls
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
@@ -117,11 +117,8 @@ def test_concatenated_scenes_do_not_interact():
     places = _rows(15).position
     one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
     two = _scene(_boxed(_box()))
-    unfolding = Unfolding.concatenate([one.unfolding, two.unfolding.with_offset(len(planes))])
-    obstacles = Obstacles.concatenate(
-        [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in (one, two)]
-    )
-    together = obstacles.visible_share(unfolding.paths(places))
+    members = [Posterior(_rows(3), phased(each, torch.zeros(len(each.sequences)))) for each in (one, two)]
+    together = Means(members).visible_share(places)
     torch.testing.assert_close(
         together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
     )
