@@ -14,7 +14,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.rows import Rows, query_elements, static_array
+from gsparc.models.image_sources.rows import Rows, channel_places, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 
@@ -63,15 +63,11 @@ class Frame:
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        if self.site.moving_end == "rx":
-            places = query_elements(self.site, query.rx, len(query), self.antennas)
-            return places.reshape(-1, 3) - self.middle, len(places)
-        places = query.tx.cpu().double() - self.middle
-        array = static_array(self.site, self.antennas)
-        if array is None:
-            return places, len(places)
-        each = torch.repeat_interleave(places, len(array), 0)
-        return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
+        rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
+        position = query.rx.position if self.site.moving_end == "rx" else query.tx
+        position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
+        places = channel_places(self.site, self.antennas, position, rotation)
+        return places.flatten(0, 1), len(query)
 
     def stored(self, mean: Tensor, tones: Tensor) -> Tensor:
         """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""

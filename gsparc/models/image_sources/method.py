@@ -261,7 +261,7 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency, carrier = data.site.tones(), self.frame.carrier_hz
-        places = torch.from_numpy(measured_places(data, known).copy())
+        places = measured_places(data, known).clone()
         places[..., :3] -= self.frame.middle
         turned = orientations(scene.planes, scene.sequences)
         away = ranges_at(places.flatten(0, 1), scene.sources, turned)

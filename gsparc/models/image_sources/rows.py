@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
-from gsparc.ops import Pose
 from gsparc.physics.waves import ranges
 
 BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
@@ -60,13 +59,6 @@ class Rows:
         return static if self.array is None else static + self.array
 
 
-def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
-    """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""
-    if site.array is None or antennas == 1:
-        return position[:, None, :]
-    return position[:, None, :] + np.einsum("sij,ej->sei", rotation, np.asarray(site.array, np.float64))
-
-
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
     """Antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
 
@@ -78,13 +70,30 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
     return np.asarray(site.array, np.float64) @ np.asarray(rotation, np.float64).T
 
 
-def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> Tensor:
-    """The same (count, E, 3) for queries, with autograd: `count` poses, or one shared by all."""
-    places = rx.position.cpu().double().reshape(-1, 1, 3)
-    if site.array is not None and antennas > 1:
-        rotation = rx.rotation.cpu().double().reshape(-1, 3, 3)
-        places = places + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
-    return places.expand(count, -1, 3)
+def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
+    """Places (S, E, 3) [m] of the antennas at positions (S, 3); E = 1 when the array's geometry is unknown.
+
+    Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
+    """
+    if site.array is None or antennas == 1:
+        return position[:, None]
+    return position[:, None] + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
+
+
+def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor) -> Tensor:
+    """Where each antenna's channel is measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m].
+
+    Args:
+        site: where.
+        antennas: A, outputs of a measurement.
+        position: (S, 3) float64 [m] of the moving end.
+        rotation: (S, 3, 3), or (1, 3, 3), float64 of a moving receiver.
+    """
+    array = static_array(site, antennas)
+    if array is not None:
+        moving = position[:, None].expand(-1, len(array), -1)
+        return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
+    return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
 
 
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
@@ -106,7 +115,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     frequency, array = data.site.tones(), static_array(data.site, antennas)
     if len(index) > limit:
         index = index[np.sort(rng.permutation(len(index))[:limit])]
-    places = measured_places(data, index)
+    places = measured_places(data, index).numpy()
     per = places.shape[1]
     most = min(max(limit // max(len(index), 1), 1), per)
     wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
@@ -133,16 +142,10 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     return replace(rows, array=torch.from_numpy(array), element=torch.from_numpy(np.concatenate(element)))
 
 
-def measured_places(data: Measurements, index: np.ndarray) -> np.ndarray:
-    """Where each antenna's channel was measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m]."""
-    antennas = data.target.shape[1]
-    array = static_array(data.site, antennas)
-    if array is not None:
-        moving = np.repeat(data.moving[index][:, None], len(array), 1)
-        return np.concatenate([moving, np.broadcast_to(array, moving.shape)], 2)
-    if data.site.static_end == "rx":
-        return data.moving[index][:, None]
-    return elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
+def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
+    """`channel_places` of measurements (S,)."""
+    position, rotation = (torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation))
+    return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
 def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:

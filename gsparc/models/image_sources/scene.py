@@ -66,6 +66,11 @@ class Scene:
         return Unfolding.of(self.transmitter, self.planes, self.sequences)
 
     @property
+    def walls(self) -> list[int]:
+        """Numbers of planes that make a source of one reflection."""
+        return [i for i in range(len(self.planes)) if (i,) in self.sequences]
+
+    @property
     def turns(self) -> Tensor:
         """(K,) complex64 of size 1, the phases."""
         assert self.phase is not None

@@ -159,11 +159,9 @@ class Search:
             return 0
         position = images(scene.transmitter, scene.planes, sequences)
         candidates = scene.over(sequences).images(self.rows)
-        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
-        clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
-        chosen = pick_apart(
-            position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
-        )
+        scores, amplitude = score(Posterior(self.rows, scene), candidates)
+        most = most or SEQUENCES_PER_ROUND
+        chosen = pick_apart(position, scores, 0.5 * self.wavelength, most, SEQUENCE_SCORE, scene.sources)
         if chosen:
             self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
@@ -179,10 +177,8 @@ class Search:
             if number and late():
                 break
             spread = partial(self._spread, parent)
-            sources = search_box(
-                self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
-                self.generator, spread,
-            )  # fmt: skip
+            apart = 0.5 * self.wavelength
+            sources = search_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
             added = 0
             for position, gained, amplitude in sources:
                 if gained < FREE_SCORE:
@@ -223,7 +219,7 @@ class Search:
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
-        scores = score(self.rows, candidates, posterior.conditioned)[0].reshape(mirrored.shape[:2])
+        scores = score(posterior, candidates)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas

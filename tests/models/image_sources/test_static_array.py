@@ -152,7 +152,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     waves = steering(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(quick_score(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert score(rows, spread, Posterior(rows, scene).conditioned)[0].shape == (300,)
+    assert score(Posterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         steering(rows, points)
 

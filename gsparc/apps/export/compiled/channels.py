@@ -9,8 +9,7 @@ from gsparc.apps.export.compiled.blob import Form
 from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.query import Means
-from gsparc.models.image_sources.rows import query_elements, static_array
-from gsparc.ops import Pose
+from gsparc.models.image_sources.rows import elements, static_array
 from gsparc.physics.waves import evenly_spaced
 
 LANES = 16
@@ -25,8 +24,8 @@ def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
     array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
     if site.moving_end == "rx":
-        still = Pose(torch.zeros(3), torch.from_numpy(np.asarray(rotation, np.float32)))
-        moving = query_elements(site, still, 1, method.frame.antennas)[0].numpy()
+        turned = torch.from_numpy(np.asarray(rotation, np.float32)).double()[None]
+        moving = elements(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
     images = query.sources[None]
     if array is not None:
         images = images + torch.einsum("kij,ej->eki", query.orientations, torch.from_numpy(array))

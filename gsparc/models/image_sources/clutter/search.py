@@ -19,10 +19,9 @@ from gsparc.models.image_sources.clutter.finite_mirrors import (
     find_mirrors,
     find_patch,
     same_mirror,
-    walls,
-)
+)  # fmt: skip
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
-from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
+from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
@@ -93,8 +92,10 @@ class _ClutterSearcher:
         self.residual.waves = self.waves
         self.nll = self.residual.nll(self.visible, scene.log_amplitude).item()
 
-    def _scorer(self) -> CandidateScorer:
-        return self.residual.scorer(self.visible, self.scene.log_amplitude)
+    def _left(self) -> Unexplained:
+        scorer = self.residual.scorer(self.visible, self.scene.log_amplitude)
+        waves = self.waves * self.visible.T
+        return Unexplained(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
     def _try(self, scene: Scene, least: float, exact: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains at least `least` nats.
@@ -185,14 +186,9 @@ class _ClutterSearcher:
             self._descend(10)
 
     def _mirrors(self) -> None:
-        scene = self.scene
-        mirrors = find_mirrors(
-            self.rows, self._scorer(), scene.transmitter, scene.planes,
-            walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
-        )  # fmt: skip
-        mirrors = [mirror for mirror in mirrors if mirror.score > MIN_GAIN]
-        scorer = self._scorer()
-        placed = [self._placed(mirror, scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
+        left = self._left()
+        mirrors = [mirror for mirror in find_mirrors(left, 2 * MIRRORS) if mirror.score > MIN_GAIN]
+        placed = [self._placed(mirror, left.scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
@@ -227,9 +223,8 @@ class _ClutterSearcher:
         moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
         planes = mirror.plane.repeat(len(moves), 1)
         planes[:, 3] += moves
-        scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
-        first = len(scene.planes)
-        sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
+        scene, first = self.scene, len(self.scene.planes)
+        sequences = [word for i in range(len(moves)) for word in _sequences_over(first + i, scene.walls)]
         trial = replace(scene, planes=torch.cat([scene.planes, planes])).over(sequences)
         paths = trial.unfolding.paths(self.rows.position)
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
@@ -243,7 +238,7 @@ class _ClutterSearcher:
     def _add_mirror(self, mirror: SmallMirror) -> bool:
         """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
         scene, number = self.scene, len(self.scene.planes)
-        sequences = _sequences_over(number, walls(scene.planes, scene.sequences))
+        sequences = _sequences_over(number, scene.walls)
         endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
         trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
         if self._wide(mirror) and self._add(
@@ -285,8 +280,7 @@ class _ClutterSearcher:
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
         scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
-        clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
-        chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, min_score)
+        chosen = pick_apart(sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
@@ -295,13 +289,9 @@ class _ClutterSearcher:
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
-        scene, scorer = self.scene, self._scorer()
-        visible_waves, patches = self.waves * self.visible.T, []
-        for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
-            patch, score = find_patch(
-                scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
-                self.generator,
-            )  # fmt: skip
+        left, patches = self._left(), []
+        for number in set(range(len(self.scene.planes))) - set(self.scene.clutter.plane):
+            patch, score = find_patch(left, number)
             patches.append((score, number, patch))
         for score, number, patch in sorted(patches, key=lambda f: -f[0]):
             if score < MIN_GAIN:
@@ -315,9 +305,7 @@ class _ClutterSearcher:
 
     def _boxes(self) -> None:
         for _ in range(BOXES):
-            box, score = find_box(
-                self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator
-            )
+            box, score = find_box(self._left())
             if score < MIN_GAIN:
                 break
             clutter = self.scene.clutter.with_box(box)
@@ -332,7 +320,7 @@ class _ClutterSearcher:
         sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
         if not sequences:
             return
-        scores, _ = self._scorer().score_waves(scene.over(sequences).unobstructed(self.rows))
+        scores, _ = self._left().scorer.score_waves(scene.over(sequences).unobstructed(self.rows))
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
 
@@ -345,10 +333,7 @@ class _ClutterSearcher:
         own = self.scene.clutter.boxes[number]
         self._set_clutter(self.scene.clutter.without(number))
         near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
-        box, _ = find_box(
-            self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
-            draws=400, parents=8, seeds=torch.cat([own[None], near]),
-        )  # fmt: skip
+        box, _ = find_box(self._left(), draws=400, parents=8, seeds=torch.cat([own[None], near]))
         self._set_clutter(self.scene.clutter.with_box(box, number))
 
     def _set_clutter(self, clutter: Clutter) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -21,7 +22,7 @@ from gsparc.processes.trend import Walls
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
 MOST_SEQUENCES = 3_000  # sequences of walls of each length that are looked at, over the largest of them
 LOOKED_FROM = 100  # places
-SEQUENCES_AT_ONCE = 400
+SEQUENCES_AT_ONCE, SEEN_AT_ONCE = 400, 50
 SHORTLIST = 4  # times as many as are wanted, before what walls hide is looked at
 SEEN = 1e-3  # mean share of an image that is kept
 HIDES = 0.01  # share of one image that a rectangle takes, to be kept
@@ -136,14 +137,9 @@ def affordable(mirrors: int, length: int) -> int:
 
 
 def visible_sequences(
-    mirrors: Mirrors,
-    indices: list[int],
-    transmitter: Tensor,
-    places: Tensor,
-    order: int,
-    most: int,
+    mirrors: Mirrors, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int,
     hidden: bool,
-) -> tuple[Reflections, ...]:
+) -> tuple[Reflections, ...]:  # fmt: skip
     """At most `most` sequences, the static end's own first, then by power expected at the places.
 
     Args:
@@ -165,22 +161,17 @@ def visible_sequences(
     sequences = _distinct(candidates, transmitter, mirrors.planes)
     if not sequences or most < 2:
         return ((),)
-    every = torch.arange(len(sequences))
-    scores = torch.cat(
-        [
-            _power(mirrors, [sequences[i] for i in part.tolist()], transmitter, places, hidden)
-            for part in every.split(SEQUENCES_AT_ONCE)
-        ]
-    )
+
+    def each(said: Callable[..., Tensor], numbers: Tensor, at_once: int) -> Tensor:
+        """What is said of some sequences, so many at once."""
+        parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(at_once))
+        return torch.cat([said(mirrors, part, transmitter, places, hidden) for part in parts])
+
+    scores = each(_power, torch.arange(len(sequences)), SEQUENCES_AT_ONCE)
     best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
     best = best[scores[best] > 0]
     if hidden and len(best):
-        seen = torch.cat(
-            [
-                _share(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
-                for part in best.split(50)
-            ]
-        )
+        seen = each(_share, best, SEEN_AT_ONCE)
         best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
         best = best[power.argsort(descending=True)]
     return ((), *(sequences[i] for i in best[: most - 1].tolist()))
@@ -226,9 +217,8 @@ def _power(
     order = torch.tensor([len(sequence) for sequence in sequences])
     power = away.square().reciprocal()
     if hidden:
-        power = power * _reflected(
-            mirrors, Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
-        )
+        paths = Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
+        power = power * _reflected(mirrors, paths)
     return power.mean(1) * REFLECTED ** (2 * order)
 
 
@@ -244,7 +234,9 @@ def _reflected(mirrors: Mirrors, paths: Paths) -> Tensor:
     return (inside.all(-1) & paths.valid).float()
 
 
-def _share(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
+def _share(
+    mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
+) -> Tensor:
     """Mean visible share (W,) of sequences, walls and boxes in the way included."""
     paths = Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
     return visible_share(paths, mirrors.clutter, mirrors.planes).mean(1)
