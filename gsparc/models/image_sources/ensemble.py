@@ -18,10 +18,9 @@ from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
 from gsparc.training.race import Race, rowwise
 from gsparc.training.time_budget import TimeBudget
@@ -165,7 +164,7 @@ def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
 
 
-def ensemble_weights(members: list[Member]) -> Tensor:
+def weights_of(members: list[Member]) -> Tensor:
     """Weights of the searches in the average, (M,) float32 of sum 1."""
     error = torch.tensor([max(member.left_out, 1e-6) for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

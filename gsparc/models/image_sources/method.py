@@ -20,27 +20,12 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
-from gsparc.models.image_sources.ensemble import (
-    Look,
-    at_noise_floor,
-    ensemble_weights,
-    raced,
-    refined,
-    search_many,
-)
+from gsparc.models.image_sources.ensemble import Look, at_noise_floor, raced, refined, search_many, weights_of
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
-from gsparc.models.image_sources.rows import (  # fmt: skip
-    Rows,
-    box_of,
-    gather,
-    measured_places,
-    ranges_at,
-    scatterers,
-    static_array,
-)
+from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
@@ -155,7 +140,7 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
     def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights."""
         self._conditioned(rows, [member.scene for member in members])
-        self.weights = ensemble_weights(members)
+        self.weights = weights_of(members)
         return self
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
@@ -166,7 +151,7 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
         notes.append(f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources")
-        inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
+        inside = int(scene.scatterers(self.members[0].rows).sum())
         notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
         clutter = scene.clutter
         if len(clutter):

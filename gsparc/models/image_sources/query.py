@@ -14,8 +14,7 @@ from gsparc.models.image_sources.clutter.blocking import Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility, directions
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band

@@ -15,8 +15,6 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.physics.waves import ranges
 
-BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
-
 
 @dataclass(frozen=True)
 class Rows:
@@ -159,16 +157,6 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
     if places.shape[1] > 3:
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
     return ranges(places[:, :3], sources)
-
-
-def scatterers(points: Tensor, box: Tensor) -> Tensor:
-    """Which sources (K, 3) [m], the transmitter first, are scatterers (K,) bool; others are images.
-
-    A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands inside
-    the box (2, 3) [m] of receivers and transmitter, the transmitter itself apart, is a scatterer.
-    """
-    inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
-    return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
 
 def box_of(rows: Rows, transmitter: Tensor) -> Tensor:

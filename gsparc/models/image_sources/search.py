@@ -13,20 +13,13 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
+from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import Offsets
 from gsparc.models.image_sources.refine import learn_visibility, refine
-from gsparc.models.image_sources.reflection_orders import (
-    drop_planes,
-    find_walls,
-    orthogonal_walls,
-    prune,
-    reassign,
-)
 from gsparc.models.image_sources.rows import Rows, box_of
-from gsparc.models.image_sources.scene import Scene, direct_amplitude
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late
@@ -107,11 +100,11 @@ class Search:
                 break
             self._refine(STEPS)
             if free or number % 2:
-                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
+                self.scene = orders.drop_planes(self.rows, self.scene, 2 * self.wavelength)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, PRUNE)
+                self.scene = orders.prune(self.rows, self.scene, PRUNE)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -129,11 +122,11 @@ class Search:
     def _finish(self) -> Scene:
         self._refine(20)
         self._find_walls()
-        self._reassign(orthogonal_walls(self.scene))
-        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
+        self._reassign(orders.orthogonal_walls(self.scene))
+        self.scene = orders.drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
         self._refine(STEPS)
-        self.scene = prune(self.rows, self.scene, PRUNE)
+        self.scene = orders.prune(self.rows, self.scene, PRUNE)
         self._learn_visibility(10)
         self._refine(self.settings.final_steps)
         return self.scene
@@ -231,14 +224,14 @@ class Search:
         """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
         if len(self.scene.sequences) < 6:
             return
-        self._reassign(find_walls(self.scene.sources))
+        self._reassign(orders.find_walls(self.scene.sources))
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
         if walls is None or late():
             return
         before = self.scene
-        self.scene = reassign(before, walls)
+        self.scene = orders.reassign(before, walls)
         self._refine(20)
         for _ in range(2):
             if self._add_sequences(6):

@@ -21,8 +21,7 @@ from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import all_sequences
 from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 

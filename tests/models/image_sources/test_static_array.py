@@ -18,9 +18,8 @@ from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import gather, static_array
-from gsparc.models.image_sources.scene import Scene, steering
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, steering
 from gsparc.models.image_sources.search_cache import SearchCache
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext

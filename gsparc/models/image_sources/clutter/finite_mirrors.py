@@ -77,6 +77,14 @@ class SmallMirror:
     patch: Tensor
     score: float
 
+    def same(self, other: SmallMirror, apart: float) -> bool:
+        """Whether both are parallel, closer than `apart` [m] and overlap."""
+        parallel = (self.plane[:3] @ other.plane[:3]).abs() >= PARALLEL
+        if not parallel or (self.plane[3] - other.plane[3]).abs() > apart:
+            return False
+        low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
+        return bool((high > low).all())
+
 
 def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
     """At most so many small mirrors parallel to walls, best first.
@@ -115,18 +123,10 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
     return _apart(mirrors, 0.5 * wavelength)[:most]
 
 
-def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
-    """Whether two mirrors are parallel, closer than `apart` [m] and overlap."""
-    if (one.plane[:3] @ other.plane[:3]).abs() < PARALLEL or (one.plane[3] - other.plane[3]).abs() > apart:
-        return False
-    low, high = torch.maximum(one.patch, other.patch)[:2], torch.minimum(one.patch, other.patch)[2:]
-    return bool((high > low).all())
-
-
 def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
     apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(same_mirror(mirror, other, least) for other in apart):
+        if not any(mirror.same(other, least) for other in apart):
             apart.append(mirror)
     return apart
 

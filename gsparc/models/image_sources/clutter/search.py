@@ -14,19 +14,13 @@ from torch import Tensor
 from gsparc.models.image_sources.backprojection import pick_apart
 from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
 from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
-from gsparc.models.image_sources.clutter.finite_mirrors import (
-    SmallMirror,
-    find_mirrors,
-    find_patch,
-    same_mirror,
-)  # fmt: skip
+from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
 from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
@@ -193,7 +187,7 @@ class _ClutterSearcher:
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
                 break
-            double = any(same_mirror(mirror, other, self.wavelength) for other in added)
+            double = any(mirror.same(other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
@@ -211,7 +205,7 @@ class _ClutterSearcher:
                     corners = box.view(2, 3) @ tangents(plane).T
                     patch = torch.cat([corners.amin(0), corners.amax(0)])
                     mirror = SmallMirror(plane, patch, 0.0)
-                    if not any(same_mirror(mirror, other, SAME_FACE_M) for other in self.tried):
+                    if not any(mirror.same(other, SAME_FACE_M) for other in self.tried):
                         mirrors.append(mirror)
         self.tried += mirrors
         return mirrors

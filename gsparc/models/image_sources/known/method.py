@@ -15,21 +15,13 @@ from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import Look, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
-from gsparc.models.image_sources.known.images import (
-    MOST_PATCHES,
-    Mirrors,
-    affordable,
-    hiding,
-    start_amplitudes,
-    visible_sequences,
-)
+from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene, direct_amplitude
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.models.image_sources.search import NOISE, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
@@ -103,10 +95,9 @@ class KnownWallsGP(ImageSourceGP):
             few = affordable(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
         hidden = settings.clutter and compact(rows)
-        sequences = visible_sequences(
-            mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
-        )
-        obstacles = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
+        ends = transmitter, rows.position
+        sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
+        obstacles = mirrors.hiding(sequences, *ends) if hidden else Clutter.none()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
