@@ -24,6 +24,7 @@ from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse
 from gsparc.models.image_sources.rows import gather
+from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -170,12 +171,12 @@ class DirectionalGP(SourcesInFrame, kind="rays"):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {**self._fitted().state(self.posterior.rows), **self.posterior.state()}
+        return {"frame": self._fitted().state(), "posterior": plain(self.posterior)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, (self.frame, rows) = site, Frame.read(site, state)
-        self.posterior = SightedSources.read(rows, state)
+        self.site, self.frame = site, Frame(site, **state["frame"])
+        self.posterior = made(SightedSources, state["posterior"])
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -10,10 +10,9 @@ those of one kernel; what is uncertain of a source's place multiplies its own pa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -215,21 +214,3 @@ class SightedSources:
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):
             total += (power[k] * waves[:, k])[:, None] * self.waves[:, k].conj() * coherent
         return total
-
-    def state(self) -> dict[str, Any]:
-        """What `read` reads, without the rows."""
-        return {
-            "observer": self.observer,
-            "sources": self.positions.points,
-            "open": self.positions.covariance,
-            "power": self.power,
-            "law": [*vars(self.kernel).values()],
-            "sightings": [getattr(self.visibility, each.name) for each in fields(self.visibility)],
-        }
-
-    @staticmethod
-    def read(rows: Rows, state: dict[str, Any]) -> SightedSources:
-        """Inverse of `state`."""
-        positions = UncertainPositions(state["sources"], state["open"])
-        visibility, kernel = VisibilityGP(*state["sightings"]), GainKernel(*state["law"])
-        return SightedSources(rows, state["observer"], positions, visibility, state["power"], kernel)

@@ -97,7 +97,7 @@ def search_many(
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if member := cache.find(number, noise_floor):
+        if member := cache.find(number):
             errors[number] = member.left_out
             return member
         if unwanted(number) or (number > 0 and budget.over()):

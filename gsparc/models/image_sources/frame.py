@@ -85,15 +85,9 @@ class Frame:
         unknown = torch.full((len(predicted),), float("nan"))
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
-    def state(self, rows: Rows) -> dict[str, Any]:
-        """What `read` reads, with the rows in the frame."""
-        numbers = [self.middle, self.scale, self.carrier_hz]
-        return {"antennas": self.antennas, "frame": numbers, "rows": [*vars(rows).values()]}
-
-    @staticmethod
-    def read(site: Site, state: dict[str, Any]) -> tuple[Frame, Rows]:
-        """Inverse of `state`."""
-        return Frame(site, int(state["antennas"]), *state["frame"]), Rows(*state["rows"])
+    def state(self) -> dict[str, Any]:
+        """What makes it again, of the same site."""
+        return {name: value for name, value in vars(self).items() if name != "site"}
 
 
 class SourcesInFrame(ClosedForm):

@@ -31,6 +31,7 @@ from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
+from gsparc.models.plain import made, plain
 from gsparc.models.reduced import MeanOnly
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
@@ -315,19 +316,18 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            **self._fitted().state(self.members[0].rows),
-            "weights": self.weights,
-            "noise_floor": self.noise_floor,
+            "frame": self._fitted().state(),
             "factors": self.factors,
-            "scenes": [member.scene.state() for member in self.members],
+            "weights": self.weights,
+            "rows": plain(self.members[0].rows),
+            "scenes": [plain(member.scene) for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, (self.frame, rows) = site, Frame.read(site, state)
-        self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
-        self.factors = state["factors"]
-        self._conditioned(rows, [Scene.from_state(stored, self.noise_floor) for stored in state["scenes"]])
+        self.site, self.frame = site, Frame(site, **state["frame"])
+        self.factors, self.weights = state["factors"], state["weights"]
+        self._conditioned(made(Rows, state["rows"]), [made(Scene, scene) for scene in state["scenes"]])
 
     @property
     def terms(self) -> tuple[str, ...]:

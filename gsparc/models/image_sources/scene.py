@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import torch
 from torch import Tensor
@@ -179,39 +179,6 @@ class Scene:
             log_amplitude=self.log_amplitude[indices],
             clutter=self.clutter.renamed(new),
             phase=None if self.phase is None else self.phase[indices],
-        )
-
-    def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers of a scene with phases, without the noise floor."""
-        kernel = self.visibility
-        return {
-            "transmitter": self.transmitter,
-            "planes": self.planes,
-            "sequences": [list(sequence) for sequence in self.sequences],
-            "log_amplitude": self.log_amplitude,
-            "log_noise": self.log_noise,
-            "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
-            "phase": self.phase,
-            "turning": self.quadrature,
-            "boxes": self.clutter.boxes,
-            "patches": self.clutter.patches,
-            "patched": list(self.clutter.plane),
-        }
-
-    @staticmethod
-    def from_state(state: dict[str, Any], noise_floor: float) -> Scene:
-        """Inverse of `state`."""
-        return Scene(
-            state["transmitter"],
-            state["planes"],
-            tuple(map(tuple, state["sequences"])),
-            state["log_amplitude"],
-            float(state["log_noise"]),
-            KernelVisibility(*state["visibility"]),
-            Clutter(state["boxes"], state["patches"], tuple(state["patched"])),
-            state["phase"],
-            float(state["turning"]),
-            noise_floor,
         )
 
 

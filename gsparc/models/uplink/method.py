@@ -140,9 +140,10 @@ class UplinkField(UplinkMethod):
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
         found, left = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
-        columns = zip(*(vars(part).values() for part in found), strict=True)
-        sources, left = Sources(*map(torch.cat, columns)), torch.cat(left)
-        return SearchResult(replace(sources, delay=sources.delay + mean[:, None]), left, uplink, noise)
+        sources = Sources(*map(torch.cat, zip(*(vars(part).values() for part in found), strict=True)))
+        return SearchResult(
+            replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
+        )
 
     def _prepare(self, site: Site, settings: SearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
