@@ -182,5 +182,5 @@ def _together(scenes: list[Scene], counts: list[int]) -> tuple[Unfolding, Obstac
         for scene, first in zip(scenes, [0, *accumulate(map(len, planes))], strict=False)
         for sequence in scene.sequences
     ]
-    unfolding = Unfolding.of(torch.cat(transmitters), torch.cat(planes), tuple(sequences))
-    return unfolding, Obstacles.of([scene.clutter for scene in scenes], planes, counts)
+    unfolding = Unfolding(torch.cat(transmitters), torch.cat(planes), tuple(sequences))
+    return unfolding, Obstacles([scene.clutter for scene in scenes], planes, counts)

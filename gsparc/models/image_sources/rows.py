@@ -117,27 +117,22 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     per = places.shape[1]
     most = min(max(limit // max(len(index), 1), 1), per)
     wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
-    position, tone, target, receiver, element = [], [], [], [], []
+    parts = []
     for row, place in zip(index, places, strict=True):
-        values = data.target[row]  # (A, K)
+        values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:
                 continue
-            comb = np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)
-            chosen = known[comb]
-            tone.append(frequency[chosen])
-            position.append(np.repeat(place[e, None, :3], count, 0))
-            target.append(values[e, chosen][:, None] if per > 1 else values[:, chosen].T)
-            receiver.append(np.full(count, row))
-            element.append(np.full(count, e))
-    columns = (position, tone, [each.astype(np.complex64) for each in target], receiver)
-    rows = Rows(*(torch.from_numpy(np.concatenate(column)) for column in columns))
-    if array is None:
-        return rows
-    return replace(rows, array=torch.from_numpy(array), element=torch.from_numpy(np.concatenate(element)))
+            comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
+            at, target = np.repeat(place[e, None, :3], count, 0), values[e, comb][:, None]
+            target = target if per > 1 else values[:, comb].T
+            parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
+    *columns, element = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True))
+    rows = Rows(*columns)
+    return rows if array is None else replace(rows, array=torch.from_numpy(array), element=element)
 
 
 def measured_places(data: Measurements, index: np.ndarray) -> Tensor:

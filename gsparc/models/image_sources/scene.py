@@ -109,7 +109,7 @@ class Scene:
     @cached_property
     def unfolding(self) -> Unfolding:
         """The legs of every sequence's path."""
-        return Unfolding.of(self.transmitter, self.planes, self.sequences)
+        return Unfolding(self.transmitter, self.planes, self.sequences)
 
     @property
     def walls(self) -> list[int]:

@@ -87,7 +87,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
 
 def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     places = _rows(20).position
-    paths = Unfolding.of(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
+    paths = Unfolding(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
     torch.testing.assert_close(paths.start[:, :, 0], places.float().expand(2, -1, -1))
     torch.testing.assert_close(paths.end[:, :, -1], TRANSMITTER.float().expand(2, 20, 3))
     torch.testing.assert_close(paths.end[:, :, :-1], paths.start[:, :, 1:])
@@ -97,7 +97,7 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     length = (paths.end - paths.start).norm(dim=-1).sum(-1)
     torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
     behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
-    assert not Unfolding.of(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
+    assert not Unfolding(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
 
 
 def test_a_patch_reflects_inside_only_and_hides_what_is_behind():

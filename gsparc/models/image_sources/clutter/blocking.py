@@ -66,12 +66,14 @@ class Clutter:
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
     """Visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
-    return Obstacles.of([clutter], [planes], [len(paths.valid)]).visible_share(paths, soft)
+    return Obstacles([clutter], [planes], [len(paths.valid)]).visible_share(paths, soft)
 
 
-@dataclass(frozen=True)
 class Obstacles:
     """Clutter of one or more scenes, prepared for paths of all their K sources.
+
+    Args:
+        clutters, planes, sources: of each scene its clutter, planes (P, 4) and number of sources.
 
     Attributes:
         boxes: (B, 6).
@@ -84,35 +86,20 @@ class Obstacles:
         ends: (P + 1,) bool, which planes have patches; the last is no plane.
     """
 
-    boxes: Tensor
-    box_mask: Tensor
-    patches: Tensor
-    patch_mask: Tensor
-    plane: Tensor
-    axes: Tensor
-    offset: Tensor
-    ends: Tensor
-
-    @staticmethod
-    def of(clutters: list[Clutter], planes: list[Tensor], sources: list[int]) -> Obstacles:
-        """From the clutter, planes (P, 4) and number of sources of each scene."""
+    def __init__(self, clutters: list[Clutter], planes: list[Tensor], sources: list[int]) -> None:
         first, table = [0, *accumulate(map(len, planes))], torch.cat(planes)
         numbers = [i + start for each, start in zip(clutters, first, strict=False) for i in each.plane]
         plane = torch.tensor(numbers, dtype=torch.long)
-        ends = torch.zeros(len(table) + 1, dtype=torch.bool)
-        ends[plane] = True
+        self.ends = torch.zeros(len(table) + 1, dtype=torch.bool)
+        self.ends[plane] = True
         used, owner = table[plane], _scene_of(sources)
         axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
-        return Obstacles(
-            torch.cat([each.boxes for each in clutters]),
-            (_scene_of([len(each.boxes) for each in clutters])[:, None] == owner)[..., None],
-            torch.cat([each.patches for each in clutters]),
-            (_scene_of([len(each.plane) for each in clutters])[:, None] == owner)[..., None],
-            plane.view(-1, 1, 1, 1),
-            torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3),
-            used[:, 3].float().view(-1, 1, 1, 1),
-            ends,
-        )
+        self.boxes = torch.cat([each.boxes for each in clutters])
+        self.box_mask = (_scene_of([len(each.boxes) for each in clutters])[:, None] == owner)[..., None]
+        self.patches = torch.cat([each.patches for each in clutters])
+        self.patch_mask = (_scene_of([len(each.plane) for each in clutters])[:, None] == owner)[..., None]
+        self.plane, self.offset = plane.view(-1, 1, 1, 1), used[:, 3].float().view(-1, 1, 1, 1)
+        self.axes = torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3)
 
     def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
         """Visible share (K, n) in [0, 1] of each source."""

@@ -50,9 +50,13 @@ class Paths:
         return Paths(self.points[sequences], self.plane[sequences], self.valid[sequences])
 
 
-@dataclass(frozen=True)
 class Unfolding:
     """All orders of the planes of K sequences with the same image, prepared for unfolding.
+
+    Args:
+        transmitter: (3,) float64 [m], or each source's own (K, 3).
+        planes: (P, 4) float64.
+        sequences: K of them.
 
     Attributes:
         chain: (L, K, M, 1, 3) float32 [m]; entry l is the image after l reflections.
@@ -64,35 +68,26 @@ class Unfolding:
         present: (K, M, 1) bool, whether the entry exists.
     """
 
-    chain: Tensor
-    normal: Tensor
-    offset: Tensor
-    height: Tensor
-    plane: Tensor
-    present: Tensor
-
-    @staticmethod
-    def of(transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> Unfolding:
-        """From a scene's transmitter (3,), or each source's own (K, 3), planes (P, 4) and sequences."""
+    def __init__(self, transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> None:
         variants = _equivalent_sequences(transmitter, planes, sequences)
         most, order = max(map(len, variants)), max(map(len, sequences), default=0)
         plane = torch.full((order, len(sequences), most, 1), -1)
-        present = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
+        self.present = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
         for k, mine in enumerate(variants):
             for m, sequence in enumerate(mine):
                 plane[: len(sequence), k, m, 0] = torch.tensor(sequence, dtype=torch.long)
-                present[k, m] = True
+                self.present[k, m] = True
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
-        chain = [transmitter.reshape(-1, 1, 1, 3).expand(*present.shape, 3)]
+        chain = [transmitter.reshape(-1, 1, 1, 3).expand(*self.present.shape, 3)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
         length = torch.linalg.vector_norm(used[..., :3], dim=-1, keepdim=True)
-        normal = (used[..., :3] / length).float() * exists[..., None]
-        offset, images_at = used[..., 3].float() * exists, torch.stack(chain).float()
-        height = (images_at[1:] * normal).sum(-1) - offset
-        met = torch.cat([plane.flip(0), torch.full((1, *present.shape), -1)]).permute(1, 2, 3, 0)
-        return Unfolding(images_at, normal, offset, torch.where(exists, height, -1.0), met, present)
+        self.normal = (used[..., :3] / length).float() * exists[..., None]
+        self.offset, self.chain = used[..., 3].float() * exists, torch.stack(chain).float()
+        height = (self.chain[1:] * self.normal).sum(-1) - self.offset
+        self.height = torch.where(exists, height, -1.0)
+        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).permute(1, 2, 3, 0)
 
     def paths(self, places: Tensor) -> Paths:
         """From places (n, 3) [m]."""

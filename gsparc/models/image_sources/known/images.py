@@ -88,7 +88,7 @@ class Mirrors:
 
     def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Paths:
         """From places (n, 3) to the transmitter (3,) float64 [m]."""
-        return Unfolding.of(transmitter, self.planes, tuple(sequences)).paths(places)
+        return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
     def visible_sequences(
         self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool

@@ -35,7 +35,7 @@ def test_all_images_are_the_simulators_and_as_visible():
         np.abs(told.visible.mean(0)[np.setdiff1d(np.arange(len(true)), apart.argmin(1))]).max(initial=0)
         < 0.05
     )
-    paths = Unfolding.of(transmitter, mirrors.planes, sequences).paths(torch.from_numpy(told.rx))
+    paths = Unfolding(transmitter, mirrors.planes, sequences).paths(torch.from_numpy(told.rx))
     seen = visible_share(paths, mirrors.clutter, mirrors.planes) > 0.5
     assert (seen.numpy() == told.visible[:, apart.argmin(1)].T).mean() > 0.97
 
