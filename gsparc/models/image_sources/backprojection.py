@@ -90,24 +90,18 @@ def search_box(
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
     exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(512)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
-    rates = [STEP_M * (1 - 0.8 * step / STEPS) for step in range(STEPS)]
-    (polished,) = ascend([best], lambda position: score(posterior, spread(position))[0], rates)
+    polished = best.clone().requires_grad_()
+    optimizer = torch.optim.Adam([polished], betas=(0.8, 0.95))
+    for step in range(STEPS):  # each to its own maximum, as the score's logarithms are summed
+        raise_if_cancelled()
+        optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)
+        optimizer.zero_grad()
+        (-score(posterior, spread(polished))[0].log().sum()).backward()
+        optimizer.step()
+    polished = polished.detach()
     scores, amplitude = score(posterior, spread(polished))
     chosen = pick_apart(polished, scores, min_distance, limit)
     return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
-
-
-def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[float]) -> list[Tensor]:
-    """Values (m, ...) after steps of Adam of `rates` on the sum of log scores, each to its own maximum."""
-    leaves = [value.clone().requires_grad_() for value in values]
-    optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
-    for rate in rates:
-        raise_if_cancelled()
-        optimizer.param_groups[0]["lr"] = rate
-        optimizer.zero_grad()
-        (-scores(*leaves).log().sum()).backward()
-        optimizer.step()
-    return [leaf.detach() for leaf in leaves]
 
 
 def pick_apart(

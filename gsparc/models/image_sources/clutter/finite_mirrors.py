@@ -18,8 +18,9 @@ from gsparc.models.image_sources.clutter.blocking import tangents, within
 from gsparc.models.image_sources.clutter.boxes import evolve
 from gsparc.models.image_sources.clutter.residual import Unexplained
 from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import steering
 from gsparc.physics.mirror_planes import reflect
-from gsparc.physics.waves import LIGHT, NEAR_M, wave
+from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
 
 log = logging.getLogger(__name__)
@@ -184,11 +185,8 @@ def _sources(
         meetings.append(_meeting(places, after, candidates))
         first = _meeting(places, before, wall[None].expand(len(candidates), 4))
         meetings.append(_meeting(first, once, candidates))
-    sources = (
-        [once, *more] if rows.array is None else _images(rows.static_ends(transmitter), candidates, known)
-    )
-    away = ((_distance(rows, source), met) for source, met in zip(sources, meetings, strict=True))
-    return [(wave(distance, rows.frequency), met) for distance, met in away]
+    sources = _images(rows.static_ends(transmitter), candidates, known)
+    return [(steering(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
 
 
 def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
@@ -197,14 +195,6 @@ def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
     once = reflect(start, candidates)
     pairs = ((reflect(reflect(start, wall), candidates), reflect(once, wall)) for wall in known)
     return [once, *(image for pair in pairs for image in pair)]
-
-
-def _distance(rows: Rows, sources: Tensor) -> Tensor:
-    """Distances (C, n) [m] from sources (C, 3), or (E, C, 3) of the static end's antennas."""
-    if rows.element is None:
-        return torch.cdist(sources, rows.position).clamp_min(NEAR_M)
-    apart = sources.index_select(0, rows.element) - rows.position[:, None]
-    return torch.linalg.vector_norm(apart, dim=-1).T.clamp_min(NEAR_M)
 
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.gp_likelihood import PhasedGains, shares, stacked
+from gsparc.models.image_sources.gp_likelihood import Posterior, shares, stacked
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
@@ -54,12 +54,9 @@ class Residual:
     def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
-        varying = PhasedGains(self.rows, scene.quadrature)
-        kernel = replace(scene.visibility, constant=0.0)
-        for k, source in enumerate(scene.sources):
-            varying.add(scaled[:, k], kernel.correlation(self.rows.places, source))
+        varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stacked(scaled)[1]
-        return varying.matrix, shares(scene.quadrature)[1] * (across @ across.T)
+        return varying.summed.matrix, shares(scene.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""

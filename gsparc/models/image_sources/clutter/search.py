@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -194,19 +195,16 @@ class _ClutterSearcher:
     def _mirrors_on_boxes(self) -> list[SmallMirror]:
         """Faces of boxes that are not on floor or walls, as mirrors."""
         mirrors = []
-        for box in self.scene.clutter.boxes:
-            for axis in range(3):
-                for end in (0, 3):
-                    offset = float(box[axis + end])
-                    if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
-                        continue
-                    plane = torch.zeros(4, dtype=torch.float64)
-                    plane[axis], plane[3] = 1.0, offset
-                    corners = box.view(2, 3) @ tangents(plane).T
-                    patch = torch.cat([corners.amin(0), corners.amax(0)])
-                    mirror = SmallMirror(plane, patch, 0.0)
-                    if not any(mirror.same(other, SAME_FACE_M) for other in self.tried):
-                        mirrors.append(mirror)
+        for box, axis, end in product(self.scene.clutter.boxes, range(3), (0, 3)):
+            offset = float(box[axis + end])
+            if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
+                continue
+            plane = torch.zeros(4, dtype=torch.float64)
+            plane[axis], plane[3] = 1.0, offset
+            corners = box.view(2, 3) @ tangents(plane).T
+            mirror = SmallMirror(plane, torch.cat([corners.amin(0), corners.amax(0)]), 0.0)
+            if not any(mirror.same(other, SAME_FACE_M) for other in self.tried):
+                mirrors.append(mirror)
         self.tried += mirrors
         return mirrors
 
