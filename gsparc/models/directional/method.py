@@ -94,6 +94,7 @@ class DirectionalGP(SourcesInFrame, kind="rays"):
         self._refine_positions()
         self._refit()
         changed = self._update_visibility()
+        self.posterior.prepared()
         note = (
             f"directional_gp: {self.size()} triangulated sources, direction error "
             f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
@@ -176,7 +177,7 @@ class DirectionalGP(SourcesInFrame, kind="rays"):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.frame = site, Frame(site, **state["frame"])
-        self.posterior = made(SightedSources, state["posterior"])
+        self.posterior = made(SightedSources, state["posterior"]).prepared()
 
     @property
     def terms(self) -> tuple[str, ...]:

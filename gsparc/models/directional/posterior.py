@@ -134,8 +134,12 @@ class SightedSources:
     @cached_property
     def exact(self) -> SightedSources:
         """The same in float64, of what was computed in float32."""
+        return in_double(self.prepared())
+
+    def prepared(self) -> SightedSources:
+        """Itself, with what all queries need; tensors made within the first might be for inference only."""
         assert len(self.dual_weights) == len(self.rows)
-        return in_double(self)
+        return self
 
     def learned(self) -> SightedSources:
         """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""

@@ -69,16 +69,6 @@ class Frame:
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
-    def stored(self, mean: Tensor, tones: Tensor) -> Tensor:
-        """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
-        tone_scale = (self.carrier_hz / tones).float()
-        return (mean * (tone_scale * self.scale)).reshape(-1, self.antennas, len(tones))
-
-    def prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
-        """Of the mean (B, A, K), all of it by sources, and squared error and power (B E,), normalised."""
-        variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
-        return Prediction(mean, variance * self.scale**2, (variance / prior).clamp(0, 1), mean)
-
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
@@ -118,9 +108,14 @@ class SourcesInFrame(ClosedForm):
         The variance is of gains, noise, visibility and between searches; the confidence is the explained
         share of the expected power.
         """
-        (places, _), tones = self._fitted().places(query), torch.from_numpy(self.frame.site.tones())
+        frame = self._fitted()
+        places, count = frame.places(query)
+        tones = torch.from_numpy(frame.site.tones())
         mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
-        return self.frame.prediction(self.frame.stored(mean, tones) / self.factors[:, None], variance, prior)
+        mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
+        mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
+        variance, prior = (each.reshape(count, -1).mean(1) for each in (variance, prior))
+        return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: of several searches, with the search's weight.
@@ -130,7 +125,8 @@ class SourcesInFrame(ClosedForm):
             vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
             the carrier [Hz].
         """
-        frame, (places, count) = self.frame, self._fitted().places(query)
+        frame = self._fitted()
+        places, count = frame.places(query)
         gain, away, sources = self._paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)

@@ -95,15 +95,14 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
     def _fit(
         self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
     ) -> FitReport:
-        if context.budget_s is None:
-            context = replace(context, budget_s=self.budget_s)
-        if not context.leave_out:
-            context = replace(context, effort=ALONE * context.effort)
+        budget_s = self.budget_s if context.budget_s is None else context.budget_s
+        effort = context.effort * (1.0 if context.leave_out else ALONE)
+        context = replace(context, budget_s=budget_s, effort=effort)
         budget, settings = context.time_budget(cache.spent), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
-        noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
-        self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
+        noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
+        self.noise_floor = max(1e-5, noise / self.frame.scale**2)
         notes: list[str] = []
         self.factors = torch.ones(antennas, dtype=torch.complex64)
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
@@ -146,17 +145,18 @@ class ImageSourceGP(SourcesInFrame, kind="sources"):
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
-        scene, notes = self.members[0].scene, []
+        scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
-        notes.append(f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources")
         inside = int(scene.scatterers(self.members[0].rows).sum())
-        notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
-        clutter = scene.clutter
-        if len(clutter):
-            boxes, patches = len(clutter.boxes), len(clutter.patches)
+        boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
+        notes = [
+            f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources",
+            f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers",
+        ]
+        if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
             turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()

@@ -28,7 +28,8 @@ from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_canc
 
 log = logging.getLogger(__name__)
 
-BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # parameters of a box, a patch, a patch on a new plane, a new plane
+# Parameters of a box, a patch, a patch on a new plane, a new plane, a sequence.
+BOX, PATCH, MIRROR, WALL, SEQUENCE = 6, 4, 5, 3, 1
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
 MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
@@ -92,13 +93,13 @@ class _ClutterSearcher:
         waves = self.waves * self.visible.T
         return Unexplained(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
-    def _try(self, scene: Scene, least: float, exact: bool = False) -> bool:
-        """Accept a scene after a few steps of descent, when it gains at least `least` nats.
+    def _try(self, scene: Scene, parameters: int, exact: bool = False) -> bool:
+        """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
 
         Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
         old ones would explain what the new scene occludes.
         """
-        nll = self.nll
+        nll, least = self.nll, parameters * self.parameter_cost
 
         def change() -> None:
             self._set_scene(scene)
@@ -148,11 +149,8 @@ class _ClutterSearcher:
 
     def _improve(self, soft: float) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        steps = (
-            self._mirrors, self._patches, self._boxes, self._sequences, partial(self._settle, soft),
-            self._settle_boxes,
-        )  # fmt: skip
-        for step in steps:
+        found = self._mirrors, self._patches, self._boxes, self._sequences
+        for step in (*found, partial(self._settle, soft), self._settle_boxes):
             step()
             self.whole = self.nll, self.scene
 
@@ -233,11 +231,8 @@ class _ClutterSearcher:
         sequences = _sequences_over(number, scene.walls)
         endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
         trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
-        if self._wide(mirror) and self._add(
-            endless, sequences, 1.5, WALL * self.parameter_cost, len(sequences)
-        ):
-            return True
-        return self._add(trial, sequences, 1.5, MIRROR * self.parameter_cost, len(sequences))
+        wall = self._wide(mirror) and self._add(endless, sequences, 1.5, WALL, len(sequences))
+        return wall or self._add(trial, sequences, 1.5, MIRROR, len(sequences))
 
     def _wide(self, mirror: SmallMirror) -> bool:
         """Whether a mirror covers most of the room."""
@@ -265,9 +260,9 @@ class _ClutterSearcher:
         return torch.polar(torch.ones(()), expected)
 
     def _add(
-        self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
+        self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, most: int
     ) -> bool:
-        """Try sequences of at least `min_score` nats, on a scene that may have more planes and patches."""
+        """Try sequences of at least `min_score` nats, on a scene of so many more parameters of planes."""
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
@@ -277,7 +272,7 @@ class _ClutterSearcher:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         more = [sequences[i] for i in chosen]
-        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), least)
+        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), parameters)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
@@ -293,15 +288,14 @@ class _ClutterSearcher:
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
             trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
-            self._try(trial, PATCH * self.parameter_cost, exact=True)
+            self._try(trial, PATCH, exact=True)
 
     def _boxes(self) -> None:
         for _ in range(BOXES):
             box, score = find_box(self._left())
             if score < MIN_GAIN:
                 break
-            clutter = self.scene.clutter.with_box(box)
-            if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
+            if not self._try(replace(self.scene, clutter=self.scene.clutter.with_box(box)), BOX):
                 break
 
     def _sequences(self) -> None:
@@ -314,7 +308,7 @@ class _ClutterSearcher:
             return
         scores, _ = self._left().scorer.score_waves(scene.over(sequences).unobstructed(self.rows))
         best = scores.topk(min(60, len(sequences))).indices.tolist()
-        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
+        self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
