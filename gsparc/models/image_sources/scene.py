@@ -14,7 +14,7 @@ from torch import Tensor
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.rows import Rows, box_of
-from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.physics.mirror_planes import Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
 
@@ -151,6 +151,13 @@ class Scene:
         """The same, attenuated by clutter."""
         waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
         return waves if self.phase is None else waves * self.turns
+
+    def longer(self, order: int) -> list[Reflections]:
+        """Other sequences over the planes: those of up to `order` with one more at the end, and all pairs."""
+        indices = range(len(self.planes))
+        more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
+        known = set(self.sequences)
+        return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
     def over(self, sequences: Iterable[Reflections]) -> Scene:
         """Other sequences over the same planes, of gains that are not known."""

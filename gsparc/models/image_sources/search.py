@@ -20,7 +20,7 @@ from gsparc.models.image_sources.phase_offsets import Offsets
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows, box_of
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
-from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late
 
@@ -141,22 +141,15 @@ class Search:
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
-        s, scene = self.settings, self.scene
-        indices = list(range(len(scene.planes)))
-        longer: list[Reflections] = [
-            (*w, i) for w in scene.sequences if len(w) < s.order for i in indices if not w or w[-1] != i
-        ]
-        known = set(scene.sequences)
-        sequences = [w for w in dict.fromkeys(longer + all_sequences(indices, 2)) if w not in known]
-        if not sequences:
+        scene, most = self.scene, most or SEQUENCES_PER_ROUND
+        more = scene.over(scene.longer(self.settings.order))
+        if not more.sequences:
             return 0
-        position = images(scene.transmitter, scene.planes, sequences)
-        candidates = scene.over(sequences).images(self.rows)
-        scores, amplitude = score(Posterior(self.rows, scene), candidates)
-        most = most or SEQUENCES_PER_ROUND
-        chosen = pick_apart(position, scores, 0.5 * self.wavelength, most, SEQUENCE_SCORE, scene.sources)
+        scores, amplitude = score(Posterior(self.rows, scene), more.images(self.rows))
+        apart = 0.5 * self.wavelength
+        chosen = pick_apart(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
         if chosen:
-            self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
+            self.scene = scene.with_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
     def _add_free(self) -> int:
@@ -171,19 +164,16 @@ class Search:
                 break
             spread = partial(self._spread, parent)
             apart = 0.5 * self.wavelength
-            sources = search_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
-            added = 0
-            for position, gained, amplitude in sources:
-                if gained < FREE_SCORE:
-                    continue
+            found = search_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
+            found = [source for source in found if source[1] >= FREE_SCORE]
+            for position, _, amplitude in found:
                 sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
                 self.scene = replace(self.scene, planes=planes).with_sequences(
                     [(*sequence, len(planes) - 1)], amplitude[None]
                 )
-                added += 1
-            if added:
-                return added
+            if found:
+                return len(found)
         return 0
 
     def _able(self, scene: Scene) -> list[int]:

@@ -22,7 +22,7 @@ from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
-from gsparc.physics.mirror_planes import Reflections, all_sequences
+from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
 
@@ -40,6 +40,7 @@ STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
 MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
 BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
+ORDER = 3  # largest of the reflections tried
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
 
@@ -300,10 +301,7 @@ class _ClutterSearcher:
 
     def _sequences(self) -> None:
         """Try more sequences over the present planes."""
-        scene, known = self.scene, set(self.scene.sequences)
-        indices = list(range(len(scene.planes)))
-        longer = [(*w, i) for w in scene.sequences if 0 < len(w) < 3 for i in indices if w[-1] != i]
-        sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
+        scene, sequences = self.scene, self.scene.longer(ORDER)
         if not sequences:
             return
         scores, _ = self._left().scorer.score_waves(scene.over(sequences).unobstructed(self.rows))
