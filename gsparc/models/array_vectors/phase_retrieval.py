@@ -137,9 +137,9 @@ class _Problem:
 
     @staticmethod
     def of(site: Site, images: np.ndarray) -> _Problem:
-        assert site.array is not None and site.grid is not None and site.wavelength is not None
-        known = lags(site.array, site.wavelength)
-        basis = known.basis(site.grid, site.wavelength)
+        array, grid, wavelength = site.array_geometry()
+        known = lags(array, wavelength)
+        basis = known.basis(grid, wavelength)
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
         forms = torch.einsum("ij,jkl->ikl", r, known.forms())
         projector = q / len(basis) ** 0.5
