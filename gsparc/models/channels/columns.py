@@ -107,6 +107,13 @@ class Group(At):
         """The rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
+    def drawn(self, rows: float) -> Group:
+        """At most so many rows, drawn evenly."""
+        if len(self) <= rows:
+            return self
+        index = np.random.default_rng(0).permutation(len(self))[: int(rows)]
+        return self.take(torch.from_numpy(np.sort(index)))
+
     def _tensors(self) -> dict[str, Tensor]:
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
 
@@ -166,11 +173,10 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
 
 def _order_of(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station."""
-    if data.station is None:
-        return np.arange(len(data), dtype=np.float64)
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
     order = np.empty(len(data))
-    for number in np.unique(data.station):
-        mine = np.flatnonzero(data.station == number)
+    for number in np.unique(station):
+        mine = np.flatnonzero(station == number)
         order[mine] = np.arange(len(mine))
     return order
 
@@ -187,12 +193,9 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
-        elements = [
-            ((a,), centre, offsets[a])
-            if site.static_end == "tx"
-            else ((a,), centre + rotation @ offsets[a], zero)
-            for a in range(antennas)
-        ]
+        moves = site.static_end == "tx"
+        both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
+        elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
     for band in bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
@@ -305,11 +308,4 @@ def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> 
     Groups of as many rows keep the same ones.
     """
     chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
-    subset = []
-    for number in chosen:
-        group = groups[number]
-        if len(group) > rows:
-            index = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
-            group = group.take(torch.from_numpy(index))
-        subset.append(group)
-    return tuple(subset)
+    return tuple(groups[number].drawn(rows) for number in chosen)

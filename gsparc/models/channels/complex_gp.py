@@ -102,16 +102,15 @@ class ComplexGP(ClosedForm, kind="aligned"):
 
     def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
-        places, notes, some = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
+        places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         names, run = np.unique(
             np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
         )
-        rows = Group(ANY, places, some, target, torch.from_numpy(run), some.double())
-        if len(known) > CHOSEN_ON:
-            some = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]))
+        rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
+        few = rows.drawn(CHOSEN_ON)
+        if len(few) < len(rows):
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-        few = rows.take(some)
         kernels = self._kernels(few.places, few.target)
         kernel = min(kernels, key=lambda one: misfit(*_aligned(one, few, len(names))))
         factors, ((_, told),) = _aligned(kernel, rows, len(names))

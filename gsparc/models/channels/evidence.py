@@ -21,7 +21,6 @@ from gsparc.models.channels.terms import Isotropic, Noise
 from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, cached
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import left_out as left_out_rows
 from gsparc.processes.worker import stop_when_late
 
@@ -181,8 +180,9 @@ def fit_powers(
         return own + WEAK * (at - begin).square().sum()
 
     def objective(at: Tensor) -> tuple[float, Tensor]:
-        gradient, value = torch.func.grad_and_value(penalty)(at)
-        total = float(value)
+        value = penalty(at.requires_grad_())
+        (gradient,) = torch.autograd.grad(value, at)
+        at, total = at.detach(), float(value.detach())
         for part in parts:
             own = (part.design @ at).exp()
             now = solved(part, own)
@@ -221,20 +221,8 @@ def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list
 
     Powers (P,) are its own.
     """
-    at, noise = solved(part, power), power[-1]
-    wide, inverse = part.basis.to(torch.complex128), at.given.factor.inverse
+    at, noise, wide = solved(part, power), power[-1], part.basis.to(torch.complex128)
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
-    errors = []
-    for groups in groupings:
-        if groups is None:
-            inside, outside = (wide @ inverse) * wide.conj(), 1 - wide.abs().square().sum(1)
-            error, _ = left_out_rows(inside.sum(1).real + outside / noise, alpha)
-        else:
-            error = torch.empty_like(alpha)
-            for mine in groups:
-                own = wide[mine]
-                block = own @ (inverse @ own.mH) - own @ own.mH / noise
-                block.diagonal().add_(1 / noise)
-                error[mine] = Factor.of(block).solved(alpha[mine])
-        errors.append(error)
-    return errors
+    outside = torch.eye(len(wide), dtype=torch.float64) - part.basis @ part.basis.T
+    inverse = wide @ at.given.factor.inverse @ wide.mH + outside / noise
+    return [left_out_rows(inverse, alpha, groups)[0] for groups in groupings]
