@@ -109,15 +109,11 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
         return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
 
-    step = REACH * wavelength / COARSE
-    axis = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64) * step
-    best = torch.zeros(3, dtype=torch.float64)
-    grid = torch.cartesian_prod(axis, axis, axis)
-    for _ in range(1 + REFINED):
-        score = gain(best + grid)
-        best = best + grid[score.argmax()]
-        step = step / 2
-        near = torch.tensor([-step, 0.0, step], dtype=torch.float64)
-        grid = torch.cartesian_prod(near, near, near)
+    best, step = torch.zeros(3, dtype=torch.float64), REACH * wavelength / COARSE
+    near = torch.arange(-1, 2, dtype=torch.float64)
+    coarse = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64)
+    for axis in (coarse, *(near / 2**halving for halving in range(1, REFINED + 1))):
+        grid = best + step * torch.cartesian_prod(axis, axis, axis)
+        best = grid[gain(grid).argmax()]
     unmoved, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
     return best if math.isfinite(best_gain) and best_gain > unmoved else None

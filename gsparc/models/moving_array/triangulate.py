@@ -81,16 +81,9 @@ def mixture(power: Tensor, atoms: Tensor) -> Tensor:
 
 
 def find_sources(
-    lags: Tensor,
-    receivers: Tensor,
-    first: Tensor | None,
-    rotation: Tensor,
-    space: Lags,
-    grid: SphereGrid,
-    settings: SearchSettings,
-    seed: int,
-    over: Callable[[], bool],
-) -> Tensor:
+    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
+    settings: SearchSettings, seed: int, over: Callable[[], bool],
+) -> Tensor:  # fmt: skip
     """Positions (K, 3) float32 [m] of sources.
 
     Args:
@@ -148,13 +141,9 @@ def find_sources(
 
 
 def _best(
-    candidates: Tensor,
-    images: Tensor,
-    receivers: Tensor,
-    rotation: Tensor,
-    grid: SphereGrid,
+    candidates: Tensor, images: Tensor, receivers: Tensor, rotation: Tensor, grid: SphereGrid,
     settings: SearchSettings,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
     score = torch.zeros(len(candidates))
     for image, receiver in zip(images, receivers, strict=True):
