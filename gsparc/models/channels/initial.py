@@ -136,7 +136,7 @@ def find_terms(
         with cancelled_by(budget.over):  # what the seconds end is as if it had not been tried
             search.grow(steps, notes)
     except Cancelled:
-        notes.append("waves: the seconds ended the search for terms")
+        notes.append("waves: the time limit ended the search for terms")
     return steps[-1].prior, tuple(notes)
 
 
