@@ -69,7 +69,7 @@ class ChannelSettings:
         directions: unequal powers of the diffuse field's directions.
         correlated: noise that is correlated over the order of rows.
         angles: directions of the diffuse field, of a half sphere where all places are in one plane.
-        rows: measurements that powers are learned on at most; `Effort.term_rows` in `initialise`.
+        rows: measurements that powers are learned on at most; `Effort.term_rows` in `find_terms`.
         tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
         narrow: concentration of each of these.
         knots: in that angle.

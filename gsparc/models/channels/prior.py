@@ -24,7 +24,7 @@ class ChannelPrior:
 
     def get(self, kind: type[T]) -> T | None:
         """Return the term of a kind, where there is one."""
-        return next((term for term in self.terms if type(term) is kind), None)  # type: ignore[return-value]
+        return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def __getitem__(self, kind: type[T]) -> T:
         found = self.get(kind)
