@@ -15,7 +15,7 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.models.method import Method, Prediction, suited_threads
+from gsparc.models.method import HasGaussians, Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, mapped, transforming
@@ -26,6 +26,7 @@ from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
+    from gsparc.data.site_objects import GaussianCloud
     from gsparc.prediction.channels import Paths
     from gsparc.prediction.operating_point import Operating
 
@@ -114,6 +115,11 @@ class Predictor:
         )
         site = of_station(self.site, number)
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, self._unit)
+
+    def in_levels(self, unit: str | None) -> Predictor:
+        """Return the same model whose powers are levels in a unit, dBm or dBW; None: as measured."""
+        method, whole, extra = self.method, self._whole, self.extra
+        return Predictor(method, self.site.in_levels(unit), whole, self.point, self.trusted, self.kind, extra)
 
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
@@ -329,6 +335,17 @@ class Predictor:
         if uplink is not None:
             return channels.uplink_paths(self.method, self.site, uplink)
         return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
+
+    def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
+        """Return the Gaussians that are rendered, in the world, with what they emit for these positions.
+
+        Raises:
+            ValueError: what answers is not rendered of Gaussians.
+        """
+        if not isinstance(self.method, HasGaussians):
+            raise ValueError(f"gaussians: {self.method.name} renders none")
+        cloud = self.method.gaussians(self._query(tx, rx).query)
+        return replace(cloud, means=cloud.means + self.site.origin)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.

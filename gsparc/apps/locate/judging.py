@@ -168,11 +168,10 @@ def _trust(
     """Learned from training rows that were left out, and their number."""
     brief = {"run_dir": run_dir / "left_out", "seed": int(config.seed), "budget_s": float(config.calibrate_s)}
     try:
-        make, context = run.retraining(**brief)
+        learned = run.retraining(**brief)
     except DataError as error:
         raise DataError(f"{error}: calibrate=0 goes without") from None
-    folds = int(config.calibrate)
-    result = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
+    result = locating.trusted(learned, locator, int(config.calibrate), cells)
     log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
     return result
 
