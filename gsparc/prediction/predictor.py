@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians, Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
@@ -205,6 +207,10 @@ class Predictor:
         own = _predicted(self._whole, query)
         sure = self._confidence(own, query)
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
+
+    def asked(self, query: Query) -> Prediction:
+        """Return what the model says of a query, whose places are local, in stored units."""
+        return _predicted(self.method, query)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
@@ -480,6 +486,11 @@ class Predictor:
 
 
 @torch.no_grad()
+def keep(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
+    checkpoint.amend(path, extra)
+
+
 def _predicted(method: Method, query: Query) -> Prediction:
     with suited_threads(method, len(query)):
         return method.predict(query)

@@ -36,7 +36,7 @@ from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
-from gsparc.models import checkpoint
+from gsparc.prediction.predictor import keep
 
 log = logging.getLogger(__name__)
 
@@ -146,12 +146,12 @@ def by_model(
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
     cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
-    locator, count = Locator.of(method, data, learned, unknown, start, cells, share), 0
+    locator, count = Locator.of(run.predictor, data.moving[learned], unknown, start, cells, share), 0
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
-        locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
+        locator = replace(locator, trust=trust)
         if config.store:
-            checkpoint.amend(config.ckpt, locating.trust_state(trust, unknown, locator.share))
+            keep(config.ckpt, locating.trust_state(trust, unknown, share))
     heard, placed = _snapshots(config, run)
     answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"

@@ -16,8 +16,8 @@ from gsparc.data.executor import each
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models import checkpoint
 from gsparc.models.method import Method, predictions
+from gsparc.prediction.predictor import keep
 from gsparc.prediction.refit import Learned
 
 KEY = "map"
@@ -76,7 +76,7 @@ class Promise:
 
     def keep(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
-        checkpoint.amend(path, {KEY: asdict(self)})
+        keep(path, {KEY: asdict(self)})
 
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:

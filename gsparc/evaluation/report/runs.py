@@ -14,6 +14,7 @@ import pandas as pd
 import torch
 
 from gsparc.data.files import SUMMARY, load_yaml
+from gsparc.evaluation.baselines import BASELINES
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import rows_of
 from gsparc.evaluation.summary import read_summary, write_samples
@@ -21,7 +22,6 @@ from gsparc.models.parts import leaves
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
-BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
 
