@@ -37,7 +37,7 @@ def rows_of(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
-    shared = {name: facts.get(key) for name, key in OF_RUN.items()}
+    shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
     shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
     shared |= {"fold": 0 if folds == 1 else None, "figure": DECIDING[shared["kind"]], "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
