@@ -102,6 +102,17 @@ def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
     assert document.read_text() == "no marks"
 
 
+def test_a_document_s_table_of_settings_that_differ_in_more_than_was_swept(three, tmp_path):
+    """Rows of baselines were a cell short beside the column that says so: `readme=` ended in an IndexError."""
+    for number, run in enumerate(three):
+        (run / ".hydra" / "config.yaml").write_text(f"model: {{width: {number // 2}}}")
+    document = tmp_path / "README.md"
+    document.write_text(f"{BEGIN}\n{END}\n")
+    refresh(document, find_runs(three))
+    rows = [line.count("|") for line in document.read_text().splitlines() if line.startswith("|")]
+    assert "differs, too" in document.read_text() and len(set(rows)) == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 360])
 def test_a_real_browser_opens_sorts_and_fits(written, width, browser):
