@@ -103,7 +103,7 @@ def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
 
 
 def test_a_document_s_table_of_settings_that_differ_in_more_than_was_swept(three, tmp_path):
-    """Rows of baselines were a cell short beside the column that says so: `readme=` ended in an IndexError."""
+    """Rows of baselines were a cell short beside the column that says so: an IndexError."""
     for number, run in enumerate(three):
         (run / ".hydra" / "config.yaml").write_text(f"model: {{width: {number // 2}}}")
     document = tmp_path / "README.md"
