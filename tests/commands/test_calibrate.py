@@ -91,9 +91,10 @@ def test_too_few_to_test_promise_nothing() -> None:
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
-    for name in ("rows_of", "known_positions", "position_kernel", "keep"):
-        monkeypatch.setattr(command, name, lambda *_: None)
-    monkeypatch.setattr(command, "gather", lambda *_: evidence)
+    monkeypatch.setattr(command, "rows_of", lambda *_: None)
+    for name in ("known_positions", "position_kernel", "keep"):
+        monkeypatch.setattr(command.confidence, name, lambda *_: None)
+    monkeypatch.setattr(command.confidence, "gather", lambda *_: evidence)
     how = "auto", False, 0
     stored, said = command.store("", {}, {}, Guarantee(-40.0), *how)
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
@@ -147,7 +148,7 @@ def test_evidence_of_a_method(campaign, folds) -> None:
 
 
 def test_impossible_promises_are_refused() -> None:
-    with pytest.raises(ValueError, match="between 0 and 1"):
+    with pytest.raises(ValueError, match="above 0 and below 1"):
         Guarantee(alpha=1.5)
 
 

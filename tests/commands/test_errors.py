@@ -28,7 +28,7 @@ REFUSED = [
     ("tradeoff ckpt={spectra} baselines=[] eval_on=tset", "eval_on='tset' is none of train, val, test"),
     (f"{COMPARE} only=[own/random/meen/*]", "matches no cell"),
     (f"{COMPARE} only=[own/random/mean/*] train=false", "no cell is filled"),
-    (f"{MAP} step_m=0", "above 0 metres"),
+    (f"{MAP} step_m=0", "step_m=0: a number above 0"),
     (f"{MAP} stations=[nord]", "no station 'nord'"),
     (f"{MAP} plan=missing.png", "no such file"),
     (f"{MAP} plan_points=[[0,0,0,0],[1,1,1,1]]", "goes with an image"),

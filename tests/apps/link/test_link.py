@@ -173,7 +173,7 @@ def test_a_coarse_look_may_be_all_there_is() -> None:
 
     nothing = Band(*[torch.zeros(5, 1)] * 3)
     for fine, blocks in ((8, 8), (20, 20)):
-        found = transmit(Half(), nothing, [1.0], (8, fine, 4), lambda now: None)
+        found = transmit(Half(), nothing, [1.0], (8, fine, 4))
         assert len(found) == 2 * blocks
 
 

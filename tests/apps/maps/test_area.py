@@ -80,7 +80,7 @@ def refused(said, call, *given, **how):
     ("above 0", {"step_m": 0}),
     ("above 0", {"step_m": -1.0}),
     ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
-    ("finite", {"height_m": float("nan")}),
+    ("height_m=nan", {"height_m": float("nan")}),
 ])  # fmt: skip
 def test_spoilt_grids(said, how):
     refused(said, grid_of, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})

@@ -148,6 +148,23 @@ def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
     assert of(moved) == after  # where the file is does not matter
 
 
+def test_a_job_found_done_read_its_data_first(tmp_path):
+    """Seconds for each job of a sweep said again; files of the same bytes say the same."""
+    file, read = spectra(tmp_path / "own.npz"), state()
+    configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
+    unread, same, other = map(State.unread, configs)
+    once(tmp_path, read, ends(tmp_path), unread=unread)
+    assert finished(tmp_path, same) == {"value": 1} and finished(tmp_path, other) is None
+    with file.open("ab") as stream:
+        stream.write(b" ")
+    assert finished(tmp_path, State.unread(configs[0])) is None
+    release = compose("dataset=rfid", f"dataset.root='{tmp_path}'", "model=mean")
+    before = State.unread(release)
+    (tmp_path / "more.txt").touch()
+    assert before and before != State.unread(release)
+    assert State.unread(compose("dataset=rfid", "dataset.root=null", "model=mean")) is None
+
+
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     walls, states = tmp_path / "walls.yaml", []
     for text in ("[]", "[1]"):

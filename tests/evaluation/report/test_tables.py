@@ -82,7 +82,7 @@ def test_an_interval_covers_as_often_as_it_says():
 def test_an_interval_of_a_ratio_weighs_samples(three):
     low, high = bootstrap(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
     assert low == high == pytest.approx(0.1)
-    assert interval(find_runs(three)[0], "no_such_figure") is None
+    assert interval(find_runs(three)[0].row, "no_such_figure") is None
 
 
 def test_time_to_accuracies_and_best_within_minutes(three):
@@ -153,7 +153,7 @@ def test_columns_keep_text_as_text(tmp_path):
 
 def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
-    assert find_runs(three[:1])[0].latency[0] == 0.1 and find_runs(three[1:2])[0].latency[0] == 0.5
+    assert [run.row["query_ms"] for run in find_runs(three[:2])] == [0.1, 0.5]
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
 
 
