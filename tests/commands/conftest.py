@@ -1,7 +1,5 @@
 """Fields of a second, trained once for all commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

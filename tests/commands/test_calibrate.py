@@ -1,7 +1,5 @@
 """Risk and coverage, thresholds with a promise, and whether promises hold."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

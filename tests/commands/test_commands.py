@@ -1,7 +1,5 @@
 """`gsparc COMMAND key=value ...`: the list, a typo, the help of every command, an interrupt."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """What a command refuses: one line that says what is wrong, status 1, nothing half-written."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -73,15 +71,12 @@ def prints(fingerprints, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("prints")
     level, position = fingerprints["rss_dbm"], fingerprints["position"]
     changes = {
-        "walks": {},
-        "unplaced": {"position": None},
-        "timeless": {"time_s": None},
+        "walks": {}, "unplaced": {"position": None}, "timeless": {"time_s": None},
         "silent": {"rss_dbm": np.full_like(level, np.nan)},
-        "loud": {"rss_dbm": np.where(np.isnan(level), 100, level)},
-        "short": {"position": position[1:]},
+        "loud": {"rss_dbm": np.where(np.isnan(level), 100, level)}, "short": {"position": position[1:]},
         "others": {"access_point": np.array([f"x{name}" for name in fingerprints["access_point"]])},
         "endless": {"position": np.full_like(position, np.inf)},
-    }
+    }  # fmt: skip
     for name, change in changes.items():
         parts = {key: part for key, part in {**fingerprints, **change}.items() if part is not None}
         np.savez(folder / f"{name}.npz", **parts)

@@ -1,7 +1,5 @@
 """`gsparc locate` from a trained model or a file of fingerprints to its files."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """From a table of places to a table of predictions, in degrees and in metres."""
 
-from __future__ import annotations
-
 import csv
 import logging
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`gsparc study`: each kind leaves its table, figure and summary."""
 
-from __future__ import annotations
-
 import csv
 import json
 

@@ -1,7 +1,5 @@
 """`train()` and its command, end to end on files of a second."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Measurements too large for memory: read from where they are, block by block, and the same as in memory."""
 
-from __future__ import annotations
-
 import hashlib
 import multiprocessing
 import pickle

@@ -1,7 +1,5 @@
 """Rows of Parquet merged by cells while they are read: the means of all of them, whatever the files."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Tables and arrays as strangers make them: each kind is read right, or named."""
 
-from __future__ import annotations
-
 from io import StringIO
 from pathlib import Path
 
@@ -326,18 +324,12 @@ def test_amplitudes_and_phases_are_channels(write, unit):
 
 
 STRANGERS = {
-    "c02_half_null.csv": "lines 2 to 208:",
-    "c03_minus.csv": "3 stations",
-    "c03_survey.csv": "3 stations",
-    "c06_pci.csv": "3 stations",
-    "c06_dms.csv": "3 stations",
-    "c06_nmea.csv": "NMEA",
-    "c07_uji.csv": "dataset.columns.x=LONGITUDE",
-    "c08_gw_null.csv": "ttn-roof-3: no fix",
-    "c11_us915.csv": "1 stations",
-    "silent_100.csv": "514 of 720 levels are exactly 100",
+    "c02_half_null.csv": "lines 2 to 208:", "c03_minus.csv": "3 stations", "c03_survey.csv": "3 stations",
+    "c06_pci.csv": "3 stations", "c06_dms.csv": "3 stations", "c06_nmea.csv": "NMEA",
+    "c07_uji.csv": "dataset.columns.x=LONGITUDE", "c08_gw_null.csv": "ttn-roof-3: no fix",
+    "c11_us915.csv": "1 stations", "silent_100.csv": "514 of 720 levels are exactly 100",
     "c10_ampphase.csv": "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STRANGERS)

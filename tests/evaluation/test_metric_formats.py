@@ -1,7 +1,5 @@
 """How figures of merit are shown and compared."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsparc.evaluation.metric_formats import DECIDING, FIGURES, PER_SAMPLE, TABLES, lower_is_better, score_of

@@ -1,7 +1,5 @@
 """Answers over HTTP: many clients, malformed requests, clients that die, a stop after what is under way."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

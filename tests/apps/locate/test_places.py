@@ -1,7 +1,5 @@
 """`gsparc compare task=locate`: models that were kept say where their test rows were heard."""
 
-from __future__ import annotations
-
 import pytest
 from campaigns import compose, spectra
 from hydra import initialize_config_module

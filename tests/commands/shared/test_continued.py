@@ -1,7 +1,5 @@
 """A run that goes on from another one has its settings; a job that a launcher lost is said."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsparc.commands.shared.cli import _message_of

@@ -1,7 +1,5 @@
 """Two runs in one folder: the second is refused before it writes, whatever became of the first."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

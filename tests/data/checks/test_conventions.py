@@ -1,7 +1,5 @@
 """Files that follow other conventions than the schema's: named, and mended by the setting that is named."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -80,13 +78,10 @@ OF_CSI = {
     ),
 }
 OF_SPECTRA = {
-    "zenith": lambda v: v[:, ::-1],
-    "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
-    "azimuth_180": lambda v: np.roll(v, 18, axis=2),
-    "azimuth_north": lambda v: np.roll(v, -9, axis=2),
-    "transposed": lambda v: v.swapaxes(1, 2),
-    "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
-}
+    "zenith": lambda v: v[:, ::-1], "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
+    "azimuth_180": lambda v: np.roll(v, 18, axis=2), "azimuth_north": lambda v: np.roll(v, -9, axis=2),
+    "transposed": lambda v: v.swapaxes(1, 2), "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
+}  # fmt: skip
 
 
 def settings(warnings: list[str]) -> list[str]:

@@ -31,13 +31,9 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     """Links of a wide table: places (S, d), levels (S, T), stations (T, d)."""
     rows, count = level_db.shape
     return LinkLevels(
-        np.repeat(position, count, axis=0),
-        np.tile(np.arange(count), rows),
-        level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)],
-        names,
-        station_position,
-    )
+        np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
+        [f"row {i // count}" for i in range(rows * count)], names, station_position,
+    )  # fmt: skip
 
 
 def warnings_of(levels: LinkLevels | None):

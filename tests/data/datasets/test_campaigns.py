@@ -1,8 +1,6 @@
 """Layouts of measured campaigns: what is read and measured, and what is refused with array and row."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np
@@ -269,12 +267,10 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
 
 
 MEASURED = [
-    ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4),
-    ("powder-rss-462mhz.npz", "powder", None),
-    ("ble-hall-1.npz", "ble", 81 * 12),
-    ("ble-hall-2.npz", "ble", 45 * 12),
+    ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4), ("powder-rss-462mhz.npz", "powder", None),
+    ("ble-hall-1.npz", "ble", 81 * 12), ("ble-hall-2.npz", "ble", 45 * 12),
     ("techtile-power-reci-rf-1.npz", None, 20382),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("file", "campaign", "rows"), MEASURED)

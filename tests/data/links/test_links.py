@@ -1,7 +1,5 @@
 """Stations, both ends moving, missing and censored powers: what a file may say, and what it becomes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -21,11 +19,9 @@ LONG = {"tx_position": np.repeat(WALK, STATIONS, axis=0), "station": np.tile(np.
 def town(**changes):
     """Powers of a walking transmitter at three stations, one column for each."""
     arrays = {
-        "tx_position": WALK,
-        "station_position": POSTS,
-        "station_name": np.array(["north", "east", "roof"]),
+        "tx_position": WALK, "station_position": POSTS, "station_name": np.array(["north", "east", "roof"]),
         "rssi_db": LEVELS,
-    }
+    }  # fmt: skip
     return {k: np.asarray(v) for k, v in {**arrays, **changes}.items() if v is not None}
 
 

@@ -1,7 +1,5 @@
 """A station whose level steps is another one from there on; nothing else changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which cells there are, and in which order."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,7 +1,5 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

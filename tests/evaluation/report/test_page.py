@@ -1,7 +1,5 @@
 """The page holds everything itself, opens in a browser, sorts, and is legible on a phone."""
 
-from __future__ import annotations
-
 import re
 from xml.etree import ElementTree
 
