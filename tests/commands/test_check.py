@@ -35,14 +35,11 @@ def test_good_file_is_described(tmp_path, arrays):
         assert words in text, text
 
 
-@pytest.mark.parametrize(
-    ("change", "warning"),
-    [
-        ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
-        ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
-        ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
-    ],
-)
+@pytest.mark.parametrize(("change", "warning"), [
+    ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
+    ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
+    ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
+])  # fmt: skip
 def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, change, warning, caplog):
     """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}

@@ -141,16 +141,13 @@ def with_advice(config):
     raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
 
-@pytest.mark.parametrize(
-    ("task", "line"),
-    [
-        (while_a_library_cleans_up, "error: interrupted"),
-        (in_compiled_code, "error: interrupted: Invalid bounding box"),
-        (while_it_logs, "error: interrupted"),
-        (while_a_log_waits_for_its_reader, "error: interrupted"),
-        (with_advice, "error: go on with ckpt_path=last.ckpt"),
-    ],
-)
+@pytest.mark.parametrize(("task", "line"), [
+    (while_a_library_cleans_up, "error: interrupted"),
+    (in_compiled_code, "error: interrupted: Invalid bounding box"),
+    (while_it_logs, "error: interrupted"),
+    (while_a_log_waits_for_its_reader, "error: interrupted"),
+    (with_advice, "error: go on with ckpt_path=last.ckpt"),
+])  # fmt: skip
 def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeypatch, tmp_path):
     monkeypatch.setattr("gsparc.commands.train.task", task)
     before = signal.getsignal(signal.SIGINT)

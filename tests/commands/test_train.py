@@ -248,16 +248,13 @@ def test_a_run_goes_on_with_the_same_grid_or_not_at_all(spectra_file, halfway, t
         train(short(tmp_path / "own.npz", f"ckpt_path={last}"), tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("what", "change"),
-    [
-        ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
-        ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
-        ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
-        ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
-        ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
-    ],
-)
+@pytest.mark.parametrize(("what", "change"), [
+    ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
+    ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
+    ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
+    ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
+    ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
+])  # fmt: skip
 def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, what, change):
     data = load_data({"name": "own", "file": str(spectra_file)})
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
@@ -369,14 +366,11 @@ def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp
 # -- options of the Trainer, and Lightning's own way to a model -------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "validated"),
-    [
-        (["trainer=debug"], [1]),
-        (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
-        (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
-    ],
-)
+@pytest.mark.parametrize(("options", "validated"), [
+    (["trainer=debug"], [1]),
+    (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
+    (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
+])  # fmt: skip
 def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_file, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     facts, _ = train(short(spectra_file, *options), tmp_path)

@@ -197,15 +197,11 @@ OF_ROWS = [
         },
         "rssi_db, row 7: not finite",
     ),
-    (
-        town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
-        "rssi_db, row 17, station roof: not finite",
-    ),
-    (
-        town(rssi_db=changed(LEVELS, ((4, 1), -120)), sensitivity_db=np.array(-100.0)),
-        "row 4, station east: rssi_db is -120, below -100",
-    ),
-]
+    (town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
+        "rssi_db, row 17, station roof: not finite"),
+    (town(rssi_db=changed(LEVELS, ((4, 1), -120)), sensitivity_db=np.array(-100.0)),
+        "row 4, station east: rssi_db is -120, below -100"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arrays", "says"), OF_ROWS)

@@ -29,14 +29,11 @@ def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
 
 
-@pytest.mark.parametrize(
-    ("folder", "text", "message"),
-    [
-        ("absent", None, "absent: no such directory"),
-        ("empty", None, "empty: no run in it"),
-        ("damaged", "{", "summary.json: cannot be read as a summary"),
-    ],
-)
+@pytest.mark.parametrize(("folder", "text", "message"), [
+    ("absent", None, "absent: no such directory"),
+    ("empty", None, "empty: no run in it"),
+    ("damaged", "{", "summary.json: cannot be read as a summary"),
+])  # fmt: skip
 def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
     if folder != "absent":
         (tmp_path / folder).mkdir()

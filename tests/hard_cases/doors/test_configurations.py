@@ -85,17 +85,14 @@ def test_train(slip, file, tmp_path):
     assert_refused(knock(train, "train.py", [*good, slip]), CASES[slip], tmp_path)
 
 
-@pytest.mark.parametrize(
-    "slip,says",
-    [
-        ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
-        ("eval_onn=val", "did you mean 'eval_on'"),
-        ("eval_on=vall", "did you mean 'val'"),
-        ("threads=-2", "threads=-2"),
-        ("baselines=[nearst]", "did you mean 'nearest'"),
-        ("dataset.rot=x", "did you mean 'dataset.root'"),
-    ],
-)
+@pytest.mark.parametrize("slip,says", [
+    ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
+    ("eval_onn=val", "did you mean 'eval_on'"),
+    ("eval_on=vall", "did you mean 'val'"),
+    ("threads=-2", "threads=-2"),
+    ("baselines=[nearst]", "did you mean 'nearest'"),
+    ("dataset.rot=x", "did you mean 'dataset.root'"),
+])  # fmt: skip
 def test_evaluate(slip, says, tmp_path):
     given = [f"hydra.run.dir={tmp_path}", "ckpt=absent.ckpt", slip]
     assert_refused(knock(evaluate, "evaluate", given), says, tmp_path)
