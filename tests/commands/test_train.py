@@ -29,7 +29,7 @@ from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
@@ -40,18 +40,8 @@ from gsparc.training import curve
 from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
-CONTRACT = {  # what scripts read of a summary
-    "time/train_s", "time/render_ms_p50", "time/render_ms_p95", "time/includes", "machine/threads",
-    "machine/load", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
-    "dataset/sha256", "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256", "seed",
-    "git", "versions",
-}  # fmt: skip
-FIGURES = {
-    "spectrum": {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "nmse", "skill"},
-    "csi": {"nmse", "snr_db", "skill", "nmse_scalar"},
-    "rssi": {"rmse_db", "nmse", "skill"},
-}
-PAIRED = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": None}
+
+
 KINDS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 STILL = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
          "opacities", "emission", "confidence", "gain")]  # fmt: skip
@@ -77,14 +67,12 @@ def steps(folder: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
+def test_a_run_leaves_facts_and_files(kind, tmp_path):
+    """What `evaluate` finds, and beside it what a training alone knows."""
     file = KINDS[kind](tmp_path / "own.npz")
     facts, objects = train(compose(*brief(file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert set(stored) >= CONTRACT and {f"test/{name}" for name in FIGURES[kind]} <= set(stored)
-    assert {"baseline/nearest/skill", "baseline/gp/train_s", "baseline/mean/render_ms_p50"} <= set(stored)
-    if PAIRED[kind]:
-        assert {f"paired/gp/{PAIRED[kind]}", f"paired/gp/{PAIRED[kind]}_se"} <= set(stored)
+    assert {"seed", "git", "versions", "memory/peak_mb", "paired/gp/nmse", "test/skill"} <= set(stored)
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
@@ -444,15 +432,6 @@ def test_the_objective_is_a_figure_of_the_kind():
         said = r"objective=val/nmsee: no such figure; did you mean 'val/nmse'\?"
         with pytest.raises(ValueError, match=said):
             objective_of(config, kind)
-
-
-def test_every_figure_grows_when_the_prediction_is_better():
-    """Each of them by name: what is not listed as smaller-is-better is maximised."""
-    better_is_larger = {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "snr_db"}
-    better_is_larger |= {f"snr_db_p{p}" for p in (10, 50, 90)}
-    for figure in (figure for kind in DECIDING for figure in figure_names(kind)):
-        assert lower_is_better(figure) == (figure not in better_is_larger), figure
-        assert (score_of(figure, 0.2) > score_of(figure, 0.1)) == (figure in better_is_larger)
 
 
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
