@@ -50,17 +50,6 @@ def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, ch
     assert warning in caplog.text
 
 
-def test_degrees_in_place_of_metres_were_good(tmp_path):
-    """They were looked for among coordinates about the middle of the site."""
-    rng = np.random.default_rng(0)
-    place = np.column_stack([rng.uniform(40.76, 40.8, 50), rng.uniform(-111.84, -111.8, 50), np.ones(50)])
-    arrays = {"rx_position": place, "tx_position": np.array([40.77, -111.8, 9.0])}
-    write_own(tmp_path / "a.npz", {**arrays, "rssi_db": rng.uniform(-90, -60, 50)})
-    assert "degrees? then give them as latitude and longitude" in _said(tmp_path / "a.npz")[1].replace(
-        "\n", ""
-    )
-
-
 def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):
     """It was refused for its 11,000 km in metres, later by the number of the first such row alone."""
     rng = np.random.default_rng(0)

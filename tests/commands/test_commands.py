@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import Mock
 
 import pytest
+from campaigns import compose
 from doors import Answer, knock
 
 from gsparc.__main__ import READER_LEFT, main
@@ -88,6 +89,7 @@ def test_a_reader_that_leaves_early_is_no_error(words):
 def test_files_need_no_name_where_a_command_is_about_files(tmp_path):
     given = ["a b", "c", "title=x", "-m"]
     assert COMMANDS["report"].arguments(given) == ["title=x", "-m", "runs=['a b','c']"]
+    assert compose(*COMMANDS["report"].arguments(["it's, here"]), config="report").runs == ["it's, here"]
     assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
     answer = gsparc("check", str(tmp_path / "absent.npz"))
     assert answer.status == 1 and "no such file" in answer.out[0]
