@@ -1,7 +1,5 @@
 """`gsparc tradeoff`: a table, a picture, points kept; and loading within a budget."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

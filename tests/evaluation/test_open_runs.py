@@ -1,7 +1,5 @@
 """Data of another file in the coordinates, units and stations of a model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Closed forms fitted to rows, and read back, for tests."""
 
-from __future__ import annotations
-
 import io
 from typing import TypeVar
 

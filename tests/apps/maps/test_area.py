@@ -1,7 +1,5 @@
 """Where a map lies: rectangles, polygons, floor plans; what cannot be is refused in one line."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """One more station goes where the others do not serve, by models that know stations they never heard."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

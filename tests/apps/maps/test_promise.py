@@ -1,7 +1,5 @@
 """What a promise covers, on towns that no calibration saw."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import cholesky

@@ -1,7 +1,5 @@
 """`gsparc view`: what it writes, and what it refuses in one line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drawn units and colours."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan

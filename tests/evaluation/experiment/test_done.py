@@ -1,7 +1,5 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -53,16 +51,13 @@ def cut_short(folder, name="last.ckpt"):
     return work
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"settings": {"seed": 1}},
-        {"files": {"init.file": "0"}},
-        {"data": "e"},
-        {"split": "t"},
-        {"program": "q"},
-    ],
-)
+@pytest.mark.parametrize("other", [
+    {"settings": {"seed": 1}},
+    {"files": {"init.file": "0"}},
+    {"data": "e"},
+    {"split": "t"},
+    {"program": "q"},
+])  # fmt: skip
 def test_a_cell_is_done_once_in_one_state(tmp_path, other):
     assert once(tmp_path, state(), ends(tmp_path, 1)) == once(tmp_path, state(), ends(tmp_path, 2))
     assert finished(tmp_path, state(**other)) is None

@@ -1,7 +1,5 @@
 """The page holds everything itself, opens in a browser, sorts, and is legible on a phone."""
 
-from __future__ import annotations
-
 import re
 from xml.etree import ElementTree
 
@@ -82,11 +80,6 @@ def test_a_busy_machine_is_said_once(three):
         run.facts["machine/load"] = load
     said = [text for text in warnings(runs) if "busy" in text]
     assert said == ["the machine was busy (load 0.2 to 3.0 per core): times are inflated, ratios less so"]
-
-
-def test_paths_without_a_name_are_runs():
-    assert arguments(["a b", "c", "title=x", "--cfg"]) == ["title=x", "--cfg", "runs=['a b','c']"]
-    assert compose(*arguments(["it's, here"]), config="report").runs == ["it's, here"]
 
 
 def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
