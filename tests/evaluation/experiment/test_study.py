@@ -1,7 +1,5 @@
 """Each variant's accuracy, seconds and milliseconds beside the base's, under every condition of the data."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np
