@@ -31,8 +31,9 @@ from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.method import Method
-from gsparc.models.per_station import for_links
+from gsparc.models import fitting
+from gsparc.models.method import MethodFactory
+from gsparc.models.per_station import for_stations
 from gsparc.simulate.rfid_sim import write_rfid_sim
 from gsparc.training.context import FitContext
 
@@ -46,8 +47,8 @@ HEAD = (
 )  # fmt: skip
 
 
-def make(name: str) -> Method:
-    """An unfitted method with what `model=` sets."""
+def make(name: str) -> MethodFactory:
+    """What makes the method, with what `model=` sets."""
     from hydra import compose, initialize_config_module
 
     from gsparc.models.registry import build
@@ -77,11 +78,12 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
     """A line of one method."""
-    before, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
+    before, private, factory = peak_gb(), Private(), for_stations(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
         cpu, wall = time.process_time(), time.perf_counter()
-        method.fit(data, fold, FitContext(Path(folder), stations="together"))
+        context = FitContext(Path(folder), stations="together")
+        method, _ = fitting.fit(factory, data, fold, context)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     missed = []
     for part in np.array_split(fold.test, -(-len(fold.test) // 256)):

@@ -8,7 +8,7 @@ from typing import Any
 import lightning.pytorch as L
 
 from gsparc.data.limits import Checked, setting
-from gsparc.field.fit import stands
+from gsparc.field.gradient_stage import stands
 from gsparc.field.schedule import INTERVAL, in_steps
 
 

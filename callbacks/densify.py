@@ -13,8 +13,8 @@ from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
+from gsparc.field.distributed import largest, total
 from gsparc.field.model import GaussianModel
-from gsparc.field.processes import largest, total
 from gsparc.field.readout import solved_again
 from gsparc.field.schedule import INTERVAL, STEPS, due, in_steps
 from gsparc.training.tracking import log_event

@@ -13,7 +13,7 @@ from gsparc.apps.maps.placing import (
     new_station_error,
     number,
     place_next,
-    unheard_refused,
+    unheard_stations_error,
 )
 from gsparc.apps.maps.promised import promise_of, trained
 from gsparc.commands.shared.output import coordinates, finish, run_directory
@@ -30,7 +30,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings, path = run_directory(), plain(config), str(config.ckpt)
     stored = checkpoint.read(path)
     if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
-        raise unheard_refused(path)  # before the copies of all stations are restored
+        raise unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
     query = {
         "area": settings["area"], "goal": config.goal, "threshold_db": float(config.threshold_db),

@@ -7,6 +7,7 @@ accuracy under its own name, seconds of training, milliseconds of a query and th
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -19,24 +20,24 @@ from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, content
-from gsparc.evaluation.experiment.fit import context_of
+from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Study, facts_of
 from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
-from gsparc.models.method import Method
+from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
-def variants_of(config: DictConfig) -> dict[str, Callable[[], Method]]:
+def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
     """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
 
-    def maker(overrides: Any) -> Callable[[], Method]:
-        return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
-
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
-    makers = {str(name): maker(overrides) for name, overrides in plain(config.variants).items()}
-    return makers | {name: method_class(name) for name in config.baselines}
+    variants = {
+        str(name): partial(build, OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+        for name, overrides in plain(config.variants).items()
+    }
+    return variants | {name: method_class(name) for name in config.baselines}
 
 
 def study_of(config: DictConfig) -> Study:

@@ -7,7 +7,6 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -34,15 +33,15 @@ from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.done import State, content, finished, once, program
-from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_of
-from gsparc.models import checkpoint, parts
-from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models import checkpoint, fitting
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import build, complete, known
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
@@ -82,13 +81,13 @@ class Begun:
     """What a run begins with, before anything is fitted.
 
     Attributes:
-        method: unfitted.
+        method: unfitted, or what chooses it.
         module, split: the data, read, and their folds.
         reads: which of the given options were heeded so far.
         watch: of the seconds since reading began.
     """
 
-    method: Method
+    method: MethodFactory
     module: DataModule
     split: Split
     reads: heeded.Reads
@@ -148,10 +147,10 @@ def train(
             whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
-                # `Method.fit` of every fold. For gradient steps field/fit.py `run_stage` makes the Trainer
-                # of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                # `Method.fit` of every fold. For gradient steps `run_stage` (field/gradient_stage.py) makes
+                # the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
-                fits = fit_folds(partial(deepcopy, method), data, split, contexts, keep=keep)
+                fits = fit_folds(method, data, split, contexts, keep=keep)
                 fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
 
             unused = options.unheeded(reads, fits.methods[0], data)
@@ -206,7 +205,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
     path = None if config.ckpt_path is None else Path(config.ckpt_path)
     if path is None or folds == 1:
         return [path] * folds
-    run = parts.folder_of(path, parts.FOLDS)
+    run = fitting.folder_of(path, fitting.FOLDS)
     every = [run / f"fold{number}" for number in range(folds)]
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
         raise ValueError(
@@ -216,25 +215,22 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
 
 
 def _check(
-    config: DictConfig, method: Method, data: Measurements, split: Split, resumes: Sequence[Path | None]
-) -> None:
+    config: DictConfig, method: MethodFactory, data: Measurements, split: Split,
+    resumes: Sequence[Path | None],
+) -> None:  # fmt: skip
     """Refuse now what would be found after the training.
 
     Raises:
-        ValueError: an objective, a file of walls, a split, weights to start from or a resume that cannot be.
+        ValueError: an objective, a file of walls, a split or a resume that cannot be.
     """
     objective_of(config, data.site.scored)
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
-    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
-        raise ValueError(
-            f"init_from: {method.name} takes no weights to start from, Gaussian fields do; start without it"
-        )
     if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
         raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
 
 
-def _say(config: DictConfig, method: Method, data: Measurements, split: Split) -> None:
+def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: Split) -> None:
     """Say what is learned from, and what is guessed."""
     for topic, sentence in in_short(data, split):
         log.info("%-10s%s", topic, sentence)
@@ -288,12 +284,12 @@ def _keep(
         log_of_models.info("%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
         context.curve(report.seconds, fitted.name)
-    marks = parts.marks(report, data, split.folds[number], context)
+    marks = fitting.marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 
-def _as_baseline(config: DictConfig, method: Method) -> str | None:
+def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
     plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
     kind = known().get(method.name)

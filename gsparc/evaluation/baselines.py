@@ -9,9 +9,9 @@ from pathlib import Path
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
-from gsparc.models import parts
+from gsparc.models.fitting import fit
 from gsparc.models.method import Method
-from gsparc.models.per_station import for_links, trained_stations
+from gsparc.models.per_station import for_stations, trained_stations
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -70,9 +70,9 @@ def baseline(
     unseen = eval_on == "val" and learned is None
     methods, seconds = [], []
     for number, fold in enumerate(before.folds):
-        method = for_links(method_class(name), own)
         known = replace(fold, val=fold.val[:0]) if unseen else fold
-        report = parts.fit(method, own, known, FitContext(Path()))
+        factory = for_stations(method_class(name)(), own)
+        method, report = fit(factory, own, known, FitContext(Path()))
         for note in report.notes:
             log.info("fold %d: %s", number, note)
         methods.append(method)

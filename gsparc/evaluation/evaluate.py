@@ -16,8 +16,8 @@ from gsparc.evaluation.baselines import Fitted, baseline, fitting
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
+from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
-from gsparc.models.parts import common_label
 from gsparc.prediction import timing
 from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, percentiles, queries
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +88,8 @@ class Opened:
             "stations": config.get("stations", "auto"),
             "split": None if split is None else split_settings(split),
         }  # fmt: skip
-        make, context = partial(build, config["model"], trusted=False), FitContext(**own | others)
-        return Learned(self.methods[0], make, self.data, self.split.folds[0], context)
+        factory, context = build(config["model"], trusted=False), FitContext(**own | others)
+        return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
 
 def open_files(

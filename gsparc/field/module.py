@@ -17,11 +17,11 @@ from gsparc.data.query import Batch
 from gsparc.data.schema import Site
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
+from gsparc.field.distributed import count
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import holds_window, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
-from gsparc.field.processes import count
 from gsparc.ops import UnsoundGaussian
 
 

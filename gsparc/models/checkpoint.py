@@ -18,7 +18,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import load_yaml, whole_file
 from gsparc.data.raw import stored_archive
 from gsparc.data.schema import Site, Stations
-from gsparc.models.method import Method
+from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
 
 VERSION = 1  # of what a checkpoint holds
@@ -90,12 +90,11 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     site = method.site
     if site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
-    kind = method.stored_as
     content = {
         "format": FORMAT,
         "version": VERSION,
         "method": method.name,
-        "target": f"{kind.__module__}.{kind.__qualname__}",
+        "target": import_path(method.stored_as),
         "config": config,
         "site": _plain(asdict(site), "site"),
         "state": _plain(method.state(), "state"),

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from gsparc.data.instantiate import find, refuse_foreign
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.method import Method
+from gsparc.models.method import Method, import_path
 from gsparc.training.context import FitContext
 
 
@@ -35,27 +36,16 @@ class LeftOutRows:
     variance: Tensor
 
 
-_KINDS: dict[str, type[ClosedForm]] = {}  # by the name that `stored` gives them
-
-
 class ClosedForm(Method):
     """A method that can be conditioned on other rows, and predict rows from all others.
-
-    Subclasses that are parts of stored methods give `kind`, by which `restored` knows them.
 
     Attributes:
         held: rows of groups, predicted by searches that left their group out; None where none did.
         forgets: whether `condition` on other rows leaves nothing of earlier ones but a few numbers.
     """
 
-    kind_stored: ClassVar[str]
     held: LeftOutRows | None = None
     forgets = False
-
-    def __init_subclass__(cls, kind: str = "", **rest: Any) -> None:
-        super().__init_subclass__(**rest)
-        if kind:
-            cls.kind_stored, _KINDS[kind] = kind, cls
 
     @property
     def count(self) -> int:
@@ -90,11 +80,19 @@ class ClosedForm(Method):
 
 def stored(method: ClosedForm) -> dict[str, Any]:
     """What `restored` reads."""
-    return {"kind": method.kind_stored, "state": method.state()}
+    return {"target": import_path(method.stored_as), "state": method.state()}
 
 
 def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
-    """The method whose `stored` state this was."""
-    method = _KINDS[str(state["kind"])]()
+    """The method whose `stored` state this was.
+
+    Raises:
+        ValueError: it names what is no such method of gsparc or a plugin.
+    """
+    refuse_foreign(state["target"])
+    kind = find(state["target"])
+    if not issubclass(kind, ClosedForm):
+        raise ValueError(f"{state['target']} is not in closed form: train again")
+    method = kind()
     method.restore(site, state["state"])
     return method

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
-from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
-from gsparc.data.site_objects import GaussianCloud
-from gsparc.data.splits import Fold
-from gsparc.field.module import GaussianModule
-from gsparc.models.method import HasPaths, HasProcess, Method, Reconditions
-from gsparc.models.mixture.named import Bearings, Channels, ImageSources, NamedMixture, Powers
+from gsparc.data.schema import Measurements
+from gsparc.models.each_or_together import LearnsTogether
+from gsparc.models.method import Method, import_path
+from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
 from gsparc.models.refined_places import errors_of
-from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
-from gsparc.models.stations import LearnsTogether
 from gsparc.models.terms import EffectSettings, called_for
-from gsparc.processes.powers import PowerProcess
-from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
 
@@ -48,16 +42,18 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         plain, hides = switches.residual is not False, switches.visibility
         placed = count > 0 or not plain
         residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
-        table: tuple[tuple[bool, type[NamedMixture] | None], ...] = (
+        table: tuple[tuple[bool, type[Method]], ...] = (
             (site.phase_reference == "neighbours", Channels),
             (terms.power, Powers),
             (terms.moving_array and placed, Bearings),
             (terms.phase and placed, ImageSources),
             (residual_alone, Channels),
-            (True, None),  # Gaussians are rendered, through an array where there is one
+            (terms.array, ArrayProcess),
+            (True, ImageProcess),
         )
         kind = next(kind for called, kind in table if called)
-        if kind in (None, Bearings) and hides is (kind is Bearings):
+        rendered = issubclass(kind, ImageProcess)
+        if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
             why = "spectra of a moving array hide nothing" if hides else why
             raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
@@ -65,24 +61,17 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         if kind is Channels and site.phase_reference != "neighbours":
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
             reasons.append(f"the residual is all there is: {why}")
-        if kind is None:
-            method: Method = settings.rendered.called_for(terms.array, plain)
+        method = settings.made_as(import_path(kind))
+        if rendered:
             options += ["init.name"] * (init.name in ("auto", "diffuse"))
-        else:
-            method = kind(switches, settings.position_std, init, residual_alone=not count)
     heeded.count(*options)
     for reason in reasons:
         log.info("%s", reason)
     return method
 
 
-def _its(name: str) -> Any:
-    """What the method that was chosen has under a name."""
-    return property(lambda self: getattr(self.chosen, name))
-
-
 class Gsparc(LearnsTogether):
-    """The method that a site calls for, under one name; see `choose`.
+    """Makes the method that a site calls for, under one name; see `choose`.
 
     Args:
         effects: switches of terms.
@@ -92,7 +81,7 @@ class Gsparc(LearnsTogether):
     """
 
     hands_on: ClassVar[type[Method]] = LearnedField  # whose settings `field` are
-    has_gaussians = resumable = True
+    resumable = uses_censored = True
     stored_names: ClassVar[dict[str, str]] = {
         "steps": "", "position_std": "", "loss.snapshot": "init.snapshot", "refit": "rendered.refit",
         "keep_best": "rendered.keep_best",
@@ -103,72 +92,27 @@ class Gsparc(LearnsTogether):
         name: str = "gsparc", **field: Any,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
-        self.rendered = ImageProcess(plain=effects.residual is not False, name=name, **field)
-        self.rendered.chosen_by = type(self)
+        self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
-        self.switches, self.position_std = effects, position_std
-        self.chosen: Method = self.rendered
+        self.switches, self.position_std, self._field = effects, position_std, field
 
-    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Choose the method, and fit it."""
-        self.site, self.chosen = data.site, choose(data, self)
-        log.info("%s is model=%s here", self.name, self.chosen.name)
-        self.chosen.name = self.name
-        if context.init_from is not None and self.chosen is not self.rendered:
-            raise ValueError(f"init_from: {self.name} is in closed form here, without weights to start from")
-        if self.chosen is self.rendered:
-            errors_of(data, fold, self.position_std, heeds=False)
-        return self.chosen.fit(data, fold, context)
+    def made_for(self, data: Measurements) -> Method:
+        """See `MethodFactory`; the log says what was chosen."""
+        method = choose(data, self)
+        if isinstance(method, ImageProcess):
+            errors_of(data, np.arange(len(data)), self.position_std, heeds=False)
+        log.info("%s is model=%s here", self.name, method.name)
+        method.name = self.name
+        return method
 
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        solved = "members" in state  # a field in closed form says itself what it is
-        self.site, self.chosen = site, Channels() if solved else self.rendered
-        self.chosen.name = self.name
-        self.chosen.restore(site, state)
-
-    predict = _its("predict")
-    state = _its("state")
-    size = _its("size")
-    label = _its("label")
-    made = _its("made")
-    effects = _its("effects")
-    facts = _its("facts")
-    objects = _its("objects")
-    knobs = _its("knobs")
-    contributions = _its("contributions")
-    reduced = _its("reduced")
-    threads_pay = _its("threads_pay")
-    gradient_problem = _its("gradient_problem")
-    field_alone = _its("field_alone")
-    only = _its("only")
-    parts = _its("parts")
-    fitted = _its("fitted")
-    steps = _its("steps")
-    steps_taken = _its("steps_taken")
-
-    def process(self) -> PowerProcess | None:
-        """See `HasProcess`."""
-        return self.chosen.process() if isinstance(self.chosen, HasProcess) else None
-
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """See `Reconditions`; of powers without fringes."""
-        return self.chosen.reconditioned(data, rows) if isinstance(self.chosen, Reconditions) else None
-
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `HasPaths`; those of every solution that is made of paths."""
-        if not isinstance(self.chosen, HasPaths):
-            raise ValueError("its channels are not made of paths")
-        return self.chosen.paths(query)
-
-    def gaussians(self, query: Query) -> GaussianCloud:
-        """See `HasGaussians`."""
-        return self.rendered.gaussians(query)
-
-    def module(self) -> GaussianModule:
-        """What Lightning trains, where Gaussians are rendered."""
-        return self.rendered.module()
-
-    def trainer_options(self) -> bool:
-        """See `TrainsByGradient`; before `fit` the site has not been seen."""
-        return self.chosen is self.rendered
+    def made_as(self, target: str) -> Method:
+        """See `MethodFactory`; under its own name."""
+        solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
+        if target in solved:
+            alone = not self.rendered.settings.field.count
+            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone)
+        rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
+        if target not in rendered:
+            raise ValueError(f"model=gsparc makes no {target}: train again")
+        images = replace(self.rendered.settings.response, array=False)
+        return rendered[target](plain=self.rendered.plain, **{**self._field, "response": images})

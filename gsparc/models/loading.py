@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from hydra.utils import get_class
 
 from gsparc.field.module import GaussianModule
 from gsparc.models import checkpoint
-from gsparc.models.method import Method, TrainsByGradient
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import build, known
-
-
-@runtime_checkable
-class HasModule(TrainsByGradient, Protocol):
-    """Trains a Gaussian field, and is one where `trainer_options()` says so."""
-
-    def module(self) -> GaussianModule:
-        """What Lightning trains, with schedules one step long."""
+from gsparc.models.splat.method import LearnedField
 
 
 def restore(stored: checkpoint.Stored) -> Method:
@@ -32,15 +23,16 @@ def restore(stored: checkpoint.Stored) -> Method:
     """
     model = stored.configuration.get("model")
     try:
-        if isinstance(model, dict) and model.get("_target_") == stored.target:
-            make: Callable[[], Method] = partial(build, model, trusted=False)
+        makers = stored.target, import_path(Gsparc)
+        if isinstance(model, dict) and model.get("_target_") in makers:
+            factory = build(model, trusted=False)
         elif stored.target in known().values():
-            make = get_class(stored.target)
+            factory = get_class(stored.target)()
         else:
             raise checkpoint.CheckpointError(
                 f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
             )
-        method = made_again(make, stored)
+        return made_again(factory, stored)
     except checkpoint.CheckpointError:
         raise
     except Exception as error:  # the state comes from a file: anything may be wrong with it
@@ -48,13 +40,14 @@ def restore(stored: checkpoint.Stored) -> Method:
         raise checkpoint.CheckpointError(
             f"{stored.path}: {stored.method} cannot be restored ({reason})"
         ) from error
-    return method
 
 
-def made_again(make: Callable[[], Method], stored: checkpoint.Stored) -> Method:
-    """Return what `make` makes, or a copy of it for each station, with a stored state."""
-    method = PerStation(make) if "per_station" in stored.state else make()
+def made_again(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
+    """Return what `factory` makes of the stored class, or one for each station, with a stored state."""
+    several = "per_station" in stored.state
+    method = PerStation(factory) if several else factory.made_as(stored.target)
     method.restore(stored.site, stored.state)
+    method.name = stored.method
     return method
 
 
@@ -75,6 +68,6 @@ def module_of(path: str | Path) -> GaussianModule:
         CheckpointError: unreadable, or another method's.
     """
     method, stored = load(path)
-    if not (isinstance(method, HasModule) and method.trainer_options()):
+    if not isinstance(method, LearnedField):
         raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
     return method.module()

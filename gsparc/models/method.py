@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
 
@@ -62,24 +63,71 @@ class Prediction:
         return Prediction(*(of(field.name) for field in fields(Prediction)))
 
 
-class Method(ABC):
-    """fit, predict, save, load; nothing else is asked of a method."""
+class MethodFactory(ABC):
+    """Makes unfitted methods, and says what holds for all of them before any measurements are seen."""
 
-    name: str
-    site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    name: str  # of its methods, as it appears in tables
     # Attributes that hold settings of other names, by setting; "": it tells `heeded.count` itself.
     stored_names: ClassVar[Mapping[str, str]] = {}
-    effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_parts = False  # whether it resumes parts in folders of their own
-    has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+    takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
+
+    @abstractmethod
+    def made_for(self, data: Measurements) -> Method:
+        """Return an unfitted method for measurements; their targets are not looked at.
+
+        Raises:
+            ValueError: none serves them as configured.
+        """
+
+    @abstractmethod
+    def made_as(self, target: str) -> Method:
+        """Return an unfitted method of the class that a checkpoint names, with these settings.
+
+        Raises:
+            ValueError: this makes none of that class.
+        """
+
+    def shares(self, site: Site) -> bool:
+        """Whether it learns several stations of this site at once, told which by `Query.station`."""
+        return False
+
+    def best_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
+        return "each", ""
+
+
+def import_path(kind: type) -> str:
+    """Return what a configuration or a checkpoint calls a class."""
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+class Method(MethodFactory):
+    """fit, predict, save, load; nothing else is asked of a method. Unfitted, it makes copies of itself."""
+
+    site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    effects: str | None = None  # the propagation effects that are computed, for `summary.json`
+    has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     threads_pay: bool = (
         False  # whether several threads answer a single place sooner than one: where it renders
     )
+
+    def made_for(self, data: Measurements) -> Method:
+        """See `MethodFactory`."""
+        return deepcopy(self)
+
+    def made_as(self, target: str) -> Method:
+        """See `MethodFactory`."""
+        if target != import_path(self.stored_as):
+            raise ValueError(f"model={self.name} makes no {target}: train again")
+        return deepcopy(self)
 
     @property
     def label(self) -> str:
@@ -96,7 +144,7 @@ class Method(ABC):
         return None
 
     @property
-    def stored_as(self) -> type[Method]:
+    def stored_as(self) -> type[MethodFactory]:
         """The class that a checkpoint names."""
         return type(self)
 
@@ -136,20 +184,11 @@ class Method(ABC):
         """What it found to stand in the site."""
         return SiteObjects.of()
 
-    def shares(self, site: Site) -> bool:
-        """Whether it learns several stations of this site at once, told which by `Query.station`."""
-        return False
-
-    def best_stations(
-        self, data: Measurements, fold: Fold, context: FitContext
-    ) -> tuple[Literal["each", "together"], str]:
-        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
-        return "each", ""
-
     def facts(self) -> dict[str, float | int | str | None]:
         """What `summary.json` says of a fitted model, None where it means nothing here."""
         return {
             "model/num_gaussians": self.size() if self.has_gaussians else None,
+            "model/class": type(self).__name__,
             "model/made": self.made,
             "model/choices": None,
             "model/init": None,
@@ -268,11 +307,3 @@ class Reducible(Protocol):
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """A method that answers with these settings; this one is left as it is."""
-
-
-@runtime_checkable
-class TrainsByGradient(Protocol):
-    """Trains under a Lightning Trainer and heeds its options."""
-
-    def trainer_options(self) -> bool:
-        """Whether it does with its present settings; known before `fit` or settled by it."""

@@ -8,7 +8,7 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
@@ -25,9 +25,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
-from gsparc.models import checkpoint, parts
-from gsparc.models.method import HasJoint, Method, Prediction, Reconditions
-from gsparc.models.parts import common_label
+from gsparc.models import checkpoint, fitting
+from gsparc.models.fitting import common_label
+from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions, import_path
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext, FitReport
@@ -40,21 +40,20 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that statio
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
-def for_links(make: Callable[[], Method], data: Measurements) -> Method:
-    """`make()`, or a copy of it for each station where there are several.
+def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
+    """Return what makes a method of all stations where there are several, else `factory` itself.
 
     Raises:
         ValueError: both ends move, and the method knows one that does.
     """
-    method = make()
     if data.site.stations is not None and len(data.site.stations) > 1:
-        return PerStation(make)
-    if data.site.static_end is None and not method.both_ends:
-        raise ValueError(f"{method.name}: both ends move here; it needs one that stands still")
-    return method
+        return PerStation(factory)
+    if data.site.static_end is None and not factory.both_ends:
+        raise ValueError(f"{factory.name}: both ends move here; it needs one that stands still")
+    return factory
 
 
-def trained_stations(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     """Stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
@@ -86,21 +85,21 @@ class PerStation(Method):
     """Copies of a method by station.
 
     Args:
-        make: makes an unfitted copy.
+        factory: makes the method of each.
     """
 
-    def __init__(self, make: Callable[[], Method]) -> None:
-        self._make = make
-        first = make()
-        self.name, self.guesses = first.name, first.guesses
-        self.wrapped, self.takes_budget = first, first.takes_budget
+    has_parts = True
+
+    def __init__(self, factory: MethodFactory) -> None:
+        self.factory, self.name, self.guesses = factory, factory.name, factory.guesses
+        self.takes_budget = factory.takes_budget
         self._copies: dict[int, Method] = {}
         self._shared = False  # whether one copy knows all stations
 
     @property
-    def stored_as(self) -> type[Method]:
-        """That of the copies."""
-        return type(self.wrapped)
+    def stored_as(self) -> type[MethodFactory]:
+        """What makes the copies, of which each names its own class."""
+        return type(self.factory)
 
     @property
     def label(self) -> str:
@@ -111,7 +110,7 @@ class PerStation(Method):
     def effects(self) -> str | None:  # type: ignore[override]
         """Those of the copies, each once."""
         effects = [copy.effects for copy in self._copies.values() if copy.effects is not None]
-        return ", ".join(dict.fromkeys(effects)) if effects else self.wrapped.effects
+        return ", ".join(dict.fromkeys(effects)) or None
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together.
@@ -126,8 +125,8 @@ class PerStation(Method):
         budget = context.time_budget()
         numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
-        left = None if context.resume is None else parts.folder_of(context.resume, parts.STATIONS)
-        resumable = self.wrapped.resumable and context.run_dir != Path()
+        left = None if context.resume is None else fitting.folder_of(context.resume, fitting.STATIONS)
+        resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
@@ -144,16 +143,16 @@ class PerStation(Method):
                 log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
             rows, part = self._part(data, number)
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            copy, before = self._make(), budget.counted.wall
+            before = budget.counted.wall
             try:
-                report = parts.fit(copy, part, inner, own)
+                copy, report = fitting.fit(self.factory, part, inner, own)
             except KeyboardInterrupt:
                 if not resumable or len(numbers) == 1:
                     raise
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = parts.marks(report, part, inner, own)
+                extra = fitting.marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
@@ -181,16 +180,16 @@ class PerStation(Method):
         how = context.stations
         if how == "auto":
             with heeded.apart():
-                how, why = self.wrapped.best_stations(data, fold, context)
+                how, why = self.factory.best_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
-        together, joint = how == "together", self.wrapped.shares(data.site)
+        together, joint = how == "together", self.factory.shares(data.site)
         self._shared = together and joint
-        if together and not (joint or self.wrapped.both_ends):
+        if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
-        known, unheard = trained_stations(self.wrapped, data, fold)
+        known, unheard = trained_stations(self.factory, data, fold)
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
-            if not self.wrapped.both_ends and not joint:
+            if not self.factory.both_ends and not joint:
                 names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
@@ -212,7 +211,7 @@ class PerStation(Method):
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; stations without rows among these are then as if never heard."""
-        result = PerStation(self._make)
+        result = PerStation(self.factory)
         result.site, result._shared = data.site, self._shared
         for number, copy in self._copies.items():
             own, part = self._part(data, number)
@@ -261,7 +260,7 @@ class PerStation(Method):
 
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
-        return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
+        return site if number == UNHEARD and self.factory.shares(site) else of_station(site, number)
 
     def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
@@ -282,16 +281,19 @@ class PerStation(Method):
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
 
     def state(self) -> dict[str, Any]:
-        """The state of every copy, by its station's number."""
-        copies = {str(number): copy.state() for number, copy in self._copies.items()}
+        """Class and state of every copy, by its station's number."""
+        copies = {
+            str(number): {"target": import_path(copy.stored_as), "state": copy.state()}
+            for number, copy in self._copies.items()
+        }
         return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = self._make()
-            copy.restore(self._site_of(site, int(number)), part)
+            self._copies[int(number)] = copy = self.factory.made_as(part["target"])
+            copy.restore(self._site_of(site, int(number)), part["state"])
 
     def objects(self) -> SiteObjects:
         """Those of all copies: what stands in a site stands there for all its stations."""
@@ -307,7 +309,7 @@ class PerStation(Method):
         """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
-            return self.wrapped.facts()
+            return super().facts()
         return {name: _over([one[name] for one in result], name) for name in result[0]}
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:

@@ -40,6 +40,27 @@ def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
     return method.reduced(settings, measured) if settings and isinstance(method, Reducible) else method
 
 
+class ReducedByPart(Method):
+    """Answers faster where a part of it does."""
+
+    @property
+    def reducible(self) -> Method | None:
+        """The part; None where it answers as it is."""
+        return None
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        return () if self.reducible is None else knobs(self.reducible)
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> Measured:
+        """See `Reducible`."""
+        return {} if self.reducible is None else contributions(self.reducible, data, rows)
+
+    def reduced(self, settings: Settings, measured: Measured) -> Method:
+        """See `Reducible`."""
+        return self if self.reducible is None else reduced(self.reducible, settings, measured)
+
+
 def combinations(
     method: Method, grid: Mapping[str, Sequence[Any] | None], singles: Mapping[str, Sequence[Any]]
 ) -> Iterator[dict[str, Any]]:
@@ -178,22 +199,20 @@ class Blended(View):
     Args:
         inner: answers for the field; its confidence and variance stay.
         other: what has the other mean.
-        weight: of the other mean.
-        own: of the field's.
+        blend: makes one of the field's mean and the other.
     """
 
     def __init__(
-        self, inner: Method, other: Callable[[Query], Prediction], weight: float, own: float = 1.0
+        self, inner: Method, other: Callable[[Query], Prediction], blend: Callable[[Tensor, Tensor], Tensor]
     ) -> None:
         super().__init__(inner)
-        self.other, self.weight, self.own = other, weight, own
+        self.other, self.blend = other, blend
 
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         result = self.inner.predict(query)
-        mean = result.mean if self.own == 1 else result.mean * self.own
-        mean = torch.add(mean, self.other(query).mean, alpha=self.weight)
+        mean = self.blend(result.mean, self.other(query).mean)
         return Prediction(mean, result.variance, result.unknown)
 
 
@@ -202,7 +221,7 @@ def mean_alone(process: Method, settings: Settings | None = None) -> Method:
     return reduced(process, {"confidence": False, **(settings or {})}, {})
 
 
-def averaged(own: Method, process: Method, weight: float) -> Method:
+def averaged(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
     """A reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
@@ -210,9 +229,9 @@ def averaged(own: Method, process: Method, weight: float) -> Method:
     Args:
         own: the field, reduced; `Filled` where it answers on a coarser grid.
         process: fitted.
-        weight: of the process.
+        blend: makes one of the field's mean and the process's.
     """
     lean = mean_alone(process, {"stride": own.stride} if isinstance(own, Filled) else None)
     if isinstance(own, Filled) and isinstance(lean, Filled):
-        return Filled(Blended(own.inner, lean.inner.predict, weight, 1 - weight), own.grid, own.stride)
-    return Blended(own, lean.predict, weight, 1 - weight)
+        return Filled(Blended(own.inner, lean.inner.predict, blend), own.grid, own.stride)
+    return Blended(own, lean.predict, blend)

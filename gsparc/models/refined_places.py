@@ -19,7 +19,6 @@ from torch import Tensor
 from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.mixture.weights import comparable, real
 from gsparc.ops import Pose
@@ -44,18 +43,18 @@ class Linearised:
     variance: Tensor
 
 
-def errors_of(data: Measurements, fold: Fold, asked: float | None, heeds: bool) -> np.ndarray | None:
+def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds: bool) -> np.ndarray | None:
     """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is heeded.
 
     Args:
         data: says errors where nobody asks.
-        fold: its training and validation rows are known.
+        known: rows (n,) that are learned from.
         asked: of every coordinate [m].
         heeds: whether what is fitted can place rows anew; where not, a warning says so.
     """
     with heeded.apart():
         std = data.position_std if asked is None else np.full(len(data), asked)
-    if std is None or not std[np.concatenate([fold.train, fold.val])].any():
+    if std is None or not std[known].any():
         return None
     if heeds:
         heeded.count("model.position_std")

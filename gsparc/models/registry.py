@@ -17,7 +17,7 @@ from gsparc.data.instantiate import arguments, find, node_of, plugins, refuse_fo
 from gsparc.data.limits import SettingError
 
 if TYPE_CHECKING:  # brings torch, which a list of choices does not need
-    from gsparc.models.method import Method
+    from gsparc.models.method import MethodFactory
 
 
 @cache
@@ -33,8 +33,8 @@ def known() -> dict[str, str]:
     return plugins("model") | methods()
 
 
-def method_class(name: str) -> type[Method]:
-    """The class called `name`; `ValueError` with the nearest right name when there is none."""
+def method_class(name: str) -> type[MethodFactory]:
+    """What makes the method called `name`; `ValueError` with the nearest right name when there is none."""
     if name in methods():  # before plugins, whose entry points take milliseconds to read
         return get_class(methods()[name])
     there = known()
@@ -43,8 +43,8 @@ def method_class(name: str) -> type[Method]:
     return get_class(there[name])
 
 
-def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
-    """The method that a config of the group `model` describes (unfitted).
+def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
+    """The method that a config of the group `model` describes (unfitted), or what chooses it.
 
     Args:
         config: `_target_` and its arguments.
@@ -60,11 +60,11 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
     if not trusted:
         for path in targets(OmegaConf.to_container(node, resolve=False)):
             refuse_foreign(path)
-    from gsparc.models.method import Method
+    from gsparc.models.method import MethodFactory
 
     with heeded.apart():  # what is handed on is not used yet
         method = instantiate(complete(deepcopy(node)))
-    if not isinstance(method, Method):
+    if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.models import checkpoint, parts
-from gsparc.models.per_station import for_links
+from gsparc.models import checkpoint, fitting
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -73,9 +72,10 @@ def fit(
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
-    method = for_links(partial(method_class(model), **(settings or {})), data)
-    fold = _learned_from(data, VALIDATED if method.takes_budget else 0.0, seed)
-    report = parts.fit(method, data, fold, FitContext(seed=seed, effort=effort, budget_s=budget_s))
+    factory = for_stations(method_class(model)(**(settings or {})), data)
+    fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
+    context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
+    method, report = fitting.fit(factory, data, fold, context)
     for note in report.notes:
         log.info("%s", note)
     if save is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +11,9 @@ import numpy as np
 from gsparc.data.inner_folds import InnerFolds, cut_inside
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models.method import Method, Reconditions
-from gsparc.models.per_station import PerStation, for_links, trained_stations
+from gsparc.models import fitting
+from gsparc.models.method import Method, MethodFactory, Reconditions
+from gsparc.models.per_station import PerStation, for_stations, trained_stations
 from gsparc.training.context import FitContext
 
 
@@ -23,13 +23,13 @@ class Learned:
 
     Attributes:
         method: fitted on `fold`.
-        make: an unfitted copy of it.
+        factory: made it.
         data, fold: measurements and their rows.
         context: of the fit.
     """
 
     method: Method
-    make: Callable[[], Method]
+    factory: MethodFactory
     data: Measurements
     fold: Fold
     context: FitContext
@@ -45,9 +45,7 @@ class Learned:
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""
-        method = for_links(self.make, self.data)
-        method.fit(self.data, fold, context)
-        return method
+        return fitting.fit(for_stations(self.factory, self.data), self.data, fold, context)[0]
 
     def without(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
@@ -67,6 +65,6 @@ class Learned:
         """Return a fold without test rows of stations that too few training rows are left of."""
         if not isinstance(self.method, PerStation):
             return fold
-        known, _ = trained_stations(self.method.wrapped, self.data, fold)
+        known, _ = trained_stations(self.method.factory, self.data, fold)
         assert self.data.station is not None
         return replace(fold, test=fold.test[known[self.data.station[fold.test]]])

@@ -67,7 +67,7 @@ class FitContext:
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
         datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes through.
-        trainer: makes a Lightning Trainer from further options; None: with `DEFAULTS` of `gsparc.field.fit`.
+        trainer: makes a Lightning Trainer from further options; None: as `gsparc.field.gradient_stage` does.
         callbacks: makes fresh Lightning callbacks.
         loggers: made once per run, closed by the caller.
         config_yaml: the whole configuration, stored in every checkpoint.

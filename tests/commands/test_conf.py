@@ -18,8 +18,8 @@ from omegaconf import OmegaConf, open_dict
 import gsparc.conf
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
-from gsparc.field.fit import DEFAULTS
-from gsparc.models.method import Method
+from gsparc.field.gradient_stage import DEFAULTS
+from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, methods
 
 CONF = Path(gsparc.conf.__path__[0])
@@ -47,7 +47,7 @@ def test_every_choice_composes_and_builds(choice, monkeypatch):
     group, _, name = choice.partition("=")
     own = ["dataset=own", "dataset.file=x.npz"] if group == "model" else []
     config = composed(monkeypatch, choice, *NEEDED.get(choice, own))
-    assert isinstance(build(config.model), Method)
+    assert isinstance(build(config.model), MethodFactory)
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here

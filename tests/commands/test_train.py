@@ -33,8 +33,8 @@ from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.fitting import Origin
 from gsparc.models.loading import module_of
-from gsparc.models.parts import Origin
 from gsparc.models.splat.method import LearnedField
 from gsparc.training import curve
 from gsparc.training.context import FitContext
@@ -76,7 +76,7 @@ def test_a_run_leaves_facts_and_files(kind, tmp_path):
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
-    assert isinstance(objects, Objects) and isinstance(objects.methods[0].chosen, LearnedField)
+    assert isinstance(objects, Objects) and isinstance(objects.methods[0], LearnedField)
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"model.ckpt", "per_sample.csv", "split.json", "learning_curve.csv"} <= written
 

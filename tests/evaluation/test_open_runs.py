@@ -13,7 +13,7 @@ from gsparc.data.tables.read import understand_table
 from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.open_runs import Opened, aligned
 from gsparc.evaluation.scores import score
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -35,7 +35,7 @@ def town(chosen=(0, 1, 2), **changes):
 def test_stations_in_another_order_were_answered_by_each_other(chosen):
     """One file lists the stations of a model in another order, or some of them: 31 dB off without a word."""
     data, other = town(), town(chosen)
-    method = for_links(method_class("idw"), data)
+    method = for_stations(method_class("idw")(), data)
     method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
     same = aligned(other, data.site)
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
@@ -160,11 +160,11 @@ def test_locate_built_whatever_class_a_checkpoint_named():
     settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "budget_s": 2.0}
     split = SimpleNamespace(folds=[None])
     run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, split)
-    learned = run.retraining(budget_s=5.0)
-    make, context = learned.make, learned.context
-    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
     with pytest.raises(ValueError, match=r"os\.system.*refused"):
-        make()
+        run.retraining(budget_s=5.0)
+    settings["model"] = {"_target_": "gsparc.models.baselines.nearest.Nearest"}
+    context = run.retraining(budget_s=5.0).context
+    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
     run.stored[0].configuration = {}
     with pytest.raises(DataError, match=r"a\.ckpt does not say how it was trained"):
         run.retraining()

@@ -10,9 +10,11 @@ from contexts import loaded, short
 from lightning.pytorch.callbacks import EarlyStopping
 
 from gsparc.callbacks import CostLedger
-from gsparc.field.keep_best import _surely_less
+from gsparc.field.gradient_stage import LOOKS
+from gsparc.field.keep_best import PATIENCE, _surely_less
 from gsparc.models.registry import build
 from gsparc.training import curve
+from gsparc.training.context import FitContext
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 
@@ -25,7 +27,7 @@ def measured(tmp_path_factory):
 
 def fitted(measured, folder, *more, steps=40, **context):
     file, data, fold = measured
-    method = build(compose(*brief(file, *COLD, *more)).model)
+    method = build(compose(*brief(file, *COLD, *more)).model).made_for(data)
     method.fit(data, fold, short(folder, steps, validate_every=5, **context))
     return method
 
@@ -50,6 +52,17 @@ def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
     start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
     assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
     assert "40 taken, none kept" in caplog.text  # keeping the best ends no training
+
+
+def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tmp_path, caplog):
+    """Of 60 steps on real spectra none was kept, and they took more than half of the seconds."""
+    caplog.set_level("INFO")
+    _, data, fold = measured
+    wild = "init=images", "model.keep_best=true", "model.optimizer.emission=50.0"
+    method = build(compose(*brief(measured[0], *wild)).model).made_for(data)
+    method.fit(data, fold, FitContext(tmp_path, batch_size=8))
+    assert method.steps == 0 and method.steps_taken == PATIENCE * (60 // LOOKS)
+    assert f"{PATIENCE} looks without a sure gain" in caplog.text
 
 
 def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):

@@ -16,7 +16,7 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     """Copies with their parents' opacities and emissions changed spectra by .1 and cost 7 dB."""
     file = spectra(tmp_path / "own.npz", rows=60)
     data, fold = loaded(file)
-    method = build(compose(*brief(file, "init=images", *more)).model)
+    method = build(compose(*brief(file, "init=images", *more)).model).made_for(data)
     method.fit(data, fold, short(tmp_path, 0))
     model, batch = method.fitted(), data.batch(fold.train[:8])
     densify = Densify(grad_threshold=0.5)
@@ -38,6 +38,6 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
 def test_emissions_of_networks_are_not_solved_again(tmp_path):
     file = spectra(tmp_path / "own.npz", rows=60)
     data, fold = loaded(file)
-    method = build(compose(*brief(file, "model.emission.hidden=4")).model)
+    method = build(compose(*brief(file, "model.emission.hidden=4")).model).made_for(data)
     method.fit(data, fold, short(tmp_path, 1))
     assert solved_again(method.fitted(), None, data.batch(fold.train[:2])) is None

@@ -7,7 +7,7 @@ from kinds import moving_array, static_array
 from watchdog import watched
 
 from gsparc.data.load import load, split_for
-from gsparc.evaluation.experiment.fit import context_of
+from gsparc.evaluation.experiment.folds import context_of
 from gsparc.models.registry import build
 
 LONGEST_S = 2.0  # of the thread's own processor time: a busy machine does not lengthen it
@@ -32,7 +32,7 @@ def test_every_phase_looks_at_clock_and_interrupt(kind, tmp_path):
     data = make(tmp_path)
     data = data if hasattr(data, "site") else load({"name": "own", "file": str(data)})
     config = compose("dataset=own", "dataset.file=x", f"budget_s={budget_s}", "logger=none", *overrides)
-    method = build(config.model)
+    method = build(config.model).made_for(data)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

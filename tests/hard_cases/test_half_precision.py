@@ -1,8 +1,8 @@
 """Half precision: 1 - 1e-6 rounds to 1; opacities, transmittances, logarithms and SSIM lose what they say.
 
 Remedy: features, confidence and the closed-form start compute in float32 whatever autocast says
-(gsparc/field/model.py, confidence.py, gsparc/models/splat/closed_form.py); float16 and bfloat16 tensors are
-refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's
+(gsparc/field/model.py, confidence.py, gsparc/models/splat/closed_form_start.py); float16 and bfloat16 tensors
+are refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's
 error.
 """
 

@@ -89,11 +89,11 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(tmp_path):
     target = data.target.astype(np.float32).copy()
     bad = int(fold.train[4])
     target[bad, 3, 3] = np.nan
-    method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model)
-    settings = method.rendered.settings
+    method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model).made_for(data)
+    settings = method.settings
     encoding = dataclasses.replace(settings.emission.encoding, kind="raw")
     emission = dataclasses.replace(settings.emission, encoding=encoding)
-    method.rendered.settings = dataclasses.replace(settings, emission=emission)
+    method.settings = dataclasses.replace(settings, emission=emission)
     with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
         method.fit(dataclasses.replace(data, target=target), fold, short(tmp_path, 20))
     assert (tmp_path / "nonfinite.pt").exists()

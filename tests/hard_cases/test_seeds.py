@@ -51,7 +51,7 @@ def test_no_seed_breaks(tmp_path, name, seeds):
     for seed in seeds:
         began = time.perf_counter()
         init = "sphere" if data.site.static_end == "rx" and data.site.kind == "spectrum" else "uniform"
-        method = build(compose(*brief(file, "model.refit=false", f"init={init}")).model)
+        method = build(compose(*brief(file, "model.refit=false", f"init={init}")).model).made_for(data)
         method.fit(data, fold, short(tmp_path / str(seed), 15, callbacks=callbacks, seed=seed))
         assert all(p.isfinite().all() for p in method.fitted().parameters())
         batch = data.batch(fold.test[:16])

@@ -44,7 +44,7 @@ def trained(folder: Path) -> dict[str, np.ndarray]:
         data, fold = loaded(make(folder / f"{name}.npz"))
         more = (*RENDERED, "model.field.count=40") if name == "gsparc" else ()
         config = compose(f"model={name.removesuffix('_power')}", *more)
-        method = build(config.model)
+        method = build(config.model).made_for(data)
         method.fit(data, fold, short(folder / name, 10))
         settings = OmegaConf.to_container(config.model, resolve=True)
         checkpoint.save(folder / f"{name}.ckpt", method, OmegaConf.to_yaml({"model": settings}))

@@ -11,7 +11,7 @@ from gsparc.callbacks import Checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.fit import DEFAULTS
+from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import Method
 from gsparc.models.registry import build
 from gsparc.training.context import FitContext
@@ -45,6 +45,7 @@ def trained(
     file: Path, folder: Path, steps: int, *overrides: str, **more: Any
 ) -> tuple[Method, Measurements]:
     """The splatted field of `brief`, after so many steps on a user's file; `more` is for `short`."""
-    method, (data, fold) = build(compose(*brief(file, "model.refit=false", *overrides)).model), loaded(file)
+    data, fold = loaded(file)
+    method = build(compose(*brief(file, "model.refit=false", *overrides)).model).made_for(data)
     method.fit(data, fold, short(folder, steps, **more))
     return method, data

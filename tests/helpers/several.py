@@ -22,7 +22,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.fit import DEFAULTS, run_stage
+from gsparc.field.gradient_stage import DEFAULTS, run_stage
 from gsparc.field.module import GaussianModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose

@@ -10,7 +10,7 @@ from gsparc.data.checks.coherence import allowed
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
 from gsparc.evaluation.open_runs import aligned
-from gsparc.models import aligned_rows, parts
+from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align, with_common_phase
 from gsparc.models.gsparc import Gsparc
 from gsparc.physics import row_factors
@@ -104,8 +104,7 @@ def test_stations_that_are_missing_took_the_places_of_others():
 
 def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
     fold = packets.shares(logged, 0)
-    method = Gsparc(position_std=0.001)
-    parts.fit(method, logged, fold, FitContext())
+    method, _ = fitting.fit(Gsparc(position_std=0.001), logged, fold, FitContext())
     assert "position_std is not used" in caplog.text and method.made.startswith("aligned")
 
 

@@ -21,15 +21,17 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, loading
+from gsparc.models import checkpoint, fitting, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
-from gsparc.models.mixture import residual, solutions
+from gsparc.models.mixture import fit_candidates, residual
 from gsparc.models.mixture import weights as solution_weights
+from gsparc.models.mixture.candidates import CANDIDATES
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.mixture.residual import Residual
-from gsparc.models.per_station import PerStation, for_links
+from gsparc.models.per_station import PerStation, for_stations
 from gsparc.models.registry import build, method_class
-from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.image_process import ImageProcess
 from gsparc.ops import Pose
 from gsparc.training import race
 from gsparc.training.context import FitContext, FitReport
@@ -75,7 +77,6 @@ def fit(
     folder, config = Path(mkdtemp()), compose(*small, *overrides)
     data = KINDS[name](folder)
     fold = fold_of(data)
-    method = for_links(lambda: build(config.model), data)
     seconds = budget_s or BUDGET_S.get(name, BRIEF_S)
     logger, kept = logging.getLogger("gsparc"), Kept()
     level = logger.level
@@ -84,7 +85,7 @@ def fit(
     try:
         context = short(folder, steps, validate_every=4, budget_s=seconds, budget_clock="processor", **more)
         began = time.process_time()
-        report = method.fit(data, fold, context)
+        method, report = fitting.fit(for_stations(build(config.model), data), data, fold, context)
         spent = (time.process_time() - began) / torch.get_num_threads()
     finally:
         logger.removeHandler(kept)
@@ -175,7 +176,7 @@ def test_facts_say_where_it_started_and_what_that_cost(name):
     facts = fitted.method.facts()
     assert {*facts} == {
         "model/init", "model/steps", "model/variance_explained", "model/num_gaussians", "time/init_s",
-        "model/made", "model/choices", "model/steps_taken",
+        "model/made", "model/class", "model/choices", "model/steps_taken",
     }  # fmt: skip
     assert facts["model/init"] and facts["model/init"] != "auto"
     assert facts["model/num_gaussians"] == fitted.method.size()
@@ -192,7 +193,7 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     assert all(line.startswith(("effects.", "the residual is all there is")) for line in before[:-1])
     assert before[-1].startswith("gsparc is model=")
     init = "+".join(part for part in first.partition("init=")[2].split(",")[:1])
-    assert ("by rendering" in first) == isinstance(fitted.method.chosen, ImageProcess) and init
+    assert ("by rendering" in first) == isinstance(fitted.method, ImageProcess) and init
     assert ("callbacks" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
@@ -217,10 +218,10 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     monkeypatch.setattr(solution_weights, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(residual, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(race, "HOPELESS", math.inf)
-    monkeypatch.setattr(solutions, "CONVERGED_ERROR", 0.0)
+    monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
-    field = fitted.method.chosen
+    field = fitted.method
     assert sum(field.weights) == pytest.approx(1)
     completed = [isinstance(member, Residual) and member.rest is not None for member in field.members]
     assert completed == [False, True, True]
@@ -229,9 +230,9 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert again.chosen.weights == field.weights
+    assert again.weights == field.weights
     rows = np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
-    again.chosen.condition(fitted.data, rows)  # the same rows, the same weights
+    again.condition(fitted.data, rows)  # the same rows, the same weights
     batch = asked(fitted)
     one, two = (m.predict(batch).mean for m in (fitted.method, again))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
@@ -273,11 +274,11 @@ def test_without_the_residual_gaussians_are_alone(name):
     fitted = fit(name, "model.effects.residual=false")
     method = fitted.method
     assert "residual" not in method.effects and method.size() > 0
-    if isinstance(method.chosen, ImageProcess):
+    if isinstance(method, ImageProcess):
         assert method.state()["beside"] is None
         return
     batch = asked(fitted)
-    found = method.chosen.predict(batch)
+    found = method.predict(batch)
     torch.testing.assert_close(found.mean, found.explained)
     assert not isinstance(method.only, Residual)
 
@@ -303,7 +304,7 @@ def test_a_term_that_means_nothing_here_is_refused_in_a_line(name, override, sai
 def test_stations_have_fields_of_their_own_and_share_the_seconds():
     fitted = fit("powers of several stations", stations="each")
     assert isinstance(fitted.method, PerStation) and fitted.method.effects == "residual"
-    assert all(isinstance(copy, Gsparc) for _, copy in fitted.method)
+    assert all(isinstance(copy, Powers) for _, copy in fitted.method)
     begun = [line for line in fitted.lines if line.startswith("training ")]
     given = [float(line.partition("within ")[2].split()[0]) for line in begun if "init=powers" in line]
     assert len(given) == 2 and given[1] < given[0]  # what the first left
@@ -318,16 +319,16 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
     given = []
     initialiser = lambda *args: given.append(args[-1].budget_s) or 1 / 0  # noqa: E731
-    monkeypatch.setattr(solutions, "CANDIDATES", {"powers": initialiser})
+    monkeypatch.setitem(CANDIDATES, "powers", initialiser)
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):
-        method_class("gsparc")().fit(data, fold, short(tmp_path, 10, budget_s=5.0))
+        fitting.fit(Gsparc(), data, fold, short(tmp_path, 10, budget_s=5.0))
     assert len(given) == 1 and 4 < given[0] < 5
 
 
 def test_weights_to_start_from_were_ignored_in_closed_form(tmp_path):
     data = KINDS["powers"](tmp_path)
     context = FitContext(init_from=tmp_path / "model.ckpt")
-    with pytest.raises(ValueError, match="init_from: gsparc is in closed form here"):
-        method_class("gsparc")().fit(data, fold_of(data), context)
+    with pytest.raises(ValueError, match="init_from: gsparc takes no weights to start from here"):
+        fitting.fit(Gsparc(), data, fold_of(data), context)

@@ -18,10 +18,11 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import fitting
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.experiment.fit import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, in_folders
 from gsparc.evaluation.scores import score
 from gsparc.models import checkpoint, loading
-from gsparc.models.per_station import PerStation, for_links, of_station
+from gsparc.models.fitting import fit
+from gsparc.models.per_station import PerStation, for_stations, of_station, trained_stations
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
@@ -34,7 +35,7 @@ def town():
 
 
 def fitted(name, data, fold, folder=Path()):
-    method = for_links(method_class(name), data)
+    method = for_stations(method_class(name)(), data)
     method.fit(data, fold, FitContext(folder))
     return method
 
@@ -87,7 +88,7 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
 def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(town, tmp_path):
     split = split_for({"name": "stations"}, town)
     contexts = in_folders(FitContext(tmp_path), split)
-    fits = fit_folds(method_class("mean"), town, split, contexts)
+    fits = fit_folds(method_class("mean")(), town, split, contexts)
     found = evaluate(
         fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
     ).facts  # fmt: skip
@@ -96,12 +97,12 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
     assert found["test/rmse_db"] > max(10, 2 * found["test/rmse_db_after_constant"])
     gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
     with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
-        fit_folds(gsparc_like, town, split, contexts).scored_on(town, split)
+        fit_folds(gsparc_like(), town, split, contexts).scored_on(town, split)
 
 
 def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
-    method = for_links(method_class("mean"), town)
+    method = for_stations(method_class("mean")(), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
     assert len(dict(method)) == 1 and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
     with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
@@ -111,9 +112,9 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
 def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     walk = walked(40)
     data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})
-    assert for_links(method_class("idw"), data).both_ends
+    assert for_stations(method_class("idw")(), data).both_ends
     with pytest.raises(ValueError, match="both ends move here"):
-        for_links(method_class("array"), data)
+        for_stations(method_class("array")(), data)
 
 
 def test_real_city(tmp_path):
@@ -131,7 +132,7 @@ def test_real_city(tmp_path):
     split = split_for({"name": "blocks", "side_m": 300.0}, data)
     contexts = in_folders(FitContext(tmp_path), split)
     found = {
-        name: fit_folds(method_class(name), data, split, contexts).scored_on(data, split).figures
+        name: fit_folds(method_class(name)(), data, split, contexts).scored_on(data, split).figures
         for name in ("mean", "idw")
     }
     assert 9 < found["mean"]["rmse_db"] < 11 and 6 < found["idw"]["rmse_db"] < 8
@@ -143,6 +144,16 @@ def test_a_station_that_heard_nothing_ended_the_run():
     fold = fold_of(data)
     for name in ("nearest", "kriging", "gp"):
         assert fitted(name, data, fold).predict(data.batch(fold.test)).mean.isfinite().all()
+
+
+def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
+    """It learns from them, as the processes do that it is compared with, of which a station had none."""
+    data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
+    for name in ("gsparc", "powers", "gp"):
+        assert trained_stations(method_class(name)(), data, fold_of(data))[0].all()
+    context = FitContext(stations="each", effort=0.1)
+    method, _ = fit(for_stations(method_class("gsparc")(), data), data, fold_of(data), context)
+    assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()
 
 
 def test_sectors_of_one_mast_were_answered_by_the_first():
@@ -164,7 +175,7 @@ def test_the_place_of_a_single_station_was_sought():
     for end in ("tx", "rx"):
         data = heard(posts=POSTS[1:2], end=end)
         np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
-        fold, method = fold_of(data), for_links(method_class("distance_law"), data)
+        fold, method = fold_of(data), for_stations(method_class("distance_law")(), data)
         notes = method.fit(data, fold, FitContext()).notes
         assert len(notes) == 1 and "exponent 2" in notes[0]
         assert data.batch(fold.test).rx.batched == (end == "rx")
@@ -201,8 +212,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 
 
 def test_seconds_of_stations_were_said_to_be_unused(town):
-    assert for_links(method_class("gsparc"), town).takes_budget
-    assert not for_links(method_class("idw"), town).takes_budget
+    assert for_stations(method_class("gsparc")(), town).takes_budget
+    assert not for_stations(method_class("idw")(), town).takes_budget
 
 
 def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
@@ -215,7 +226,7 @@ def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path
             return super().fit(data, fold, context)
 
     for context in (FitContext(), FitContext(tmp_path)):
-        for_links(Writes, town).fit(town, fold, context)
+        for_stations(Writes(), town).fit(town, fold, context)
     assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
 
 

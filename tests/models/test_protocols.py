@@ -30,10 +30,10 @@ from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, Reducible, suited_threads
+from gsparc.models.method import Method, MethodFactory, Reducible, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import build, method_class, methods
 from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
@@ -54,8 +54,8 @@ DECLARED = {
     "splat": "Reducible",
     "array": "Reducible",
     "moving_array": "Reducible",
-    **dict.fromkeys(("array_process", "image_process"), "Reducible"),
-    **dict.fromkeys(("gsparc", "image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
+    **dict.fromkeys(("array_process", "image_process", "gsparc"), "Reducible"),  # gsparc of spectra
+    **dict.fromkeys(("image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
 }
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
@@ -104,7 +104,7 @@ def data_of(name: str, folder: Path) -> Measurements:
     return make(folder)
 
 
-def unfitted(name: str) -> Method:
+def unfitted(name: str) -> MethodFactory:
     few = ("model.field.count=40", "model.keep_best=false")
     if name in FILES:
         return build(compose("model=gsparc", *RENDERED, *few).model)
@@ -126,7 +126,8 @@ def unfitted(name: str) -> Method:
 @cache
 def fitted(name: str) -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
-        data, method = data_of(name, Path(folder)), unfitted(name)
+        data = data_of(name, Path(folder))
+        method = unfitted(name).made_for(data)
         fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
     return method, data, fold
@@ -152,8 +153,8 @@ def ends(method: Method, moving: torch.Tensor) -> Query:
 
 
 @pytest.mark.parametrize("name", methods())
-def test_a_method_is_what_the_table_says(name):
-    method = method_class(name)()
+def test_a_method_is_what_the_table_says(name, tmp_path):
+    method = method_class(name)().made_for(data_of(name, tmp_path))
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
     assert method.resumable == (name in (*PEERS, "image_source_gp", "splat", "gsparc", *NAMED))
@@ -238,7 +239,7 @@ def test_what_is_scored_is_what_is_served(name):
 def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     data = kinds.several(tmp_path)
     fold = fold_of(data)
-    method = for_links(method_class(name), data)
+    method = for_stations(method_class(name)(), data)
     method.fit(data, fold, FitContext(tmp_path, stations=how))
     predictor = Predictor(method, data.site)
     for number in range(len(kinds.POSTS)):
@@ -250,10 +251,10 @@ def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
 @pytest.mark.parametrize("words", ["model=complex_gp", "model=gsparc model.effects.phase=false"])
 def test_places_are_served_in_the_phase_of_the_largest_run(words):
     data = from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0))
-    fold, method = fold_of(data), build(compose(*words.split()).model)
+    fold, method = fold_of(data), build(compose(*words.split()).model).made_for(data)
     method.fit(data, fold, FitContext())
     batch = data.batch(fold.test)
-    factor = getattr(method, "chosen", method).runs.of(batch.run)[:, None, None]
+    factor = method.runs.of(batch.run)[:, None, None]
     assert (factor - 1).abs().max() > 0.1
     said = served(Predictor(method, data.site), data, fold.test)
     torch.testing.assert_close(said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5)

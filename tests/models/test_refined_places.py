@@ -16,8 +16,9 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
+from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.refined_places import Linearised, displaced, displacements, refined
 from gsparc.training.context import FitContext
 
@@ -95,9 +96,7 @@ def _missed(method, exact, fold):
 
 
 def _fitted(data, fold, **settings):
-    method = Gsparc(**settings)
-    report = method.fit(data, fold, BRIEF)
-    return method, report
+    return fitting.fit(Gsparc(**settings), data, fold, BRIEF)
 
 
 def test_known_errors_of_places_cost_less_than_unknown_ones():
@@ -129,16 +128,14 @@ def test_exact_places_stay_though_errors_are_claimed():
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
-    method = for_links(lambda: Gsparc(position_std=0.05), data)
-    report = method.fit(data, fold, BRIEF)
+    _, report = fitting.fit(for_stations(Gsparc(position_std=0.05), data), data, fold, BRIEF)
     assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
 
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
     data = KINDS["images"](tmp_path)
-    fold = fold_of(data)
     with caplog.at_level(logging.WARNING):
-        Gsparc(position_std=0.05, steps=0).fit(data, fold, BRIEF)
+        Gsparc(position_std=0.05, steps=0).made_for(data)
     assert "position_std is not used" in caplog.text
 
 
@@ -155,6 +152,6 @@ def test_places_come_nearer_to_the_truth_in_techtile():
     error = np.random.default_rng(0).normal(scale=0.03, size=(len(rows), 3))
     moved = displaced(data, rows, error)
     method, _ = _fitted(moved, Fold(rows[:-20], rows[-20:], rows[:0]))
-    found, by, said = refined(method.chosen, moved, np.full(len(data), 0.03))
+    found, by, said = refined(method, moved, np.full(len(data), 0.03))
     assert np.array_equal(np.sort(found), rows) and "refined by" in said
     assert np.square(error + by)[:, :2].mean() < 0.9 * np.square(error)[:, :2].mean()

@@ -9,7 +9,7 @@ from campaigns import compose
 
 from gsparc.data import instantiate
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.method import Method
+from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class, methods
 
 
@@ -17,7 +17,7 @@ from gsparc.models.registry import build, method_class, methods
 def test_choices_hold_defaults_of_their_class(name):
     """`baselines=[gsrf]` trained other settings than `model=gsrf`."""
     chosen, own = build(compose(f"model={name}").model), method_class(name)()
-    assert isinstance(own, Method) and type(chosen) is type(own)
+    assert isinstance(own, MethodFactory) and type(chosen) is type(own)
     for key, value in vars(own).items():
         if isinstance(value, (int, float, str, tuple)) or is_dataclass(value):
             assert getattr(chosen, key) == value, key

@@ -14,7 +14,7 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.model import AttenuationSettings
 from gsparc.models.gsparc import Gsparc, choose
-from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.terms import EffectSettings
 from gsparc.ops import SphereGrid
 
@@ -37,7 +37,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         field=FieldSettings(count=count), **more,
     )  # fmt: skip
     found = choose(data, settings)
-    parts = found.tries(data) if isinstance(found, NamedMixture) else ()
+    parts = tuple(found.tries(data)) if isinstance(found, Mixture) else ()
     return parts, not parts and found.settings.response.array
 
 
@@ -51,6 +51,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         ("csi", {"count": 0}, ("diffuse",)),
         ("csi", {"effects": {"residual": False}}, ("sources",)),
         ("csi", {"init": "rays"}, ("rays", "diffuse")),
+        ("csi", {"init": "diffuse"}, ("diffuse",)),  # was weighed against itself
         ("csi", {"init": "scene"}, ("scene", "diffuse")),
         ("csi", {"hidden": 8}, ()),  # an ablation of networks is not answered by another model
         ("csi", {"init": "uniform"}, ()),

@@ -26,12 +26,12 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture.named import Powers
+from gsparc.models.method import Method, MethodFactory, Prediction
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_links
+from gsparc.models.per_station import for_stations
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -84,7 +84,7 @@ def images(folder: Path, rows: int, moving: str = "tx") -> Measurements:
     return load({"name": "own", "file": str(spectra(folder / "own.npz", rows, moving))})
 
 
-def planned(*more: str) -> Callable[[], Method]:
+def planned(*more: str) -> Callable[[], MethodFactory]:
     return lambda: build(compose("model=gsparc", *more).model)
 
 
@@ -169,7 +169,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             for module in (gp, complex_gp, powers):
                 patch.setattr(module, "MOST_ROWS", 30)
             patch.setattr(complex_gp, "NEAREST", 20)
-        method = for_links(case.make, data)
+        method = for_stations(case.make(), data).made_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
         budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))
@@ -325,7 +325,7 @@ def test_models_without_gradients_say_so(name, tmp_path):
     rendered = name == "gsparc"  # of a moving receiver
     data = images(tmp_path, 40, "rx") if rendered else kinds.received(tmp_path)
     more = (*RENDERED, "model.field.count=10", "model.keep_best=false")
-    method = planned(*more)() if rendered else method_class(name)()
+    method = (planned(*more) if rendered else method_class(name))().made_for(data)
     method.fit(data, make_split(data.moving, SplitSettings()).folds[0], short(tmp_path, 2))
     with pytest.raises(ValueError, match=f"{name} has no gradients by position: .*{REFUSED[name]}"):
         getattr(Predictor(method, data.site), data.site.kind)(rx=torch.zeros(3), grad=True)

@@ -111,7 +111,7 @@ def place_next(
     try:
         _new(predictor, candidates[0], cells[:1])
     except ValueError as refused:
-        raise unheard_refused(f"{predictor.method.name} ({refused})") from None
+        raise unheard_stations_error(f"{predictor.method.name} ({refused})") from None
     left, right, south, north = grid.extent
     now = map_of(
         predictor,
@@ -184,7 +184,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 
-def unheard_refused(what: str) -> DataError:
+def unheard_stations_error(what: str) -> DataError:
     """For models that know no station but those they learned from."""
     return DataError(
         f"{what}: answers only for the stations that it heard; train with stations=together, for example "

@@ -25,7 +25,7 @@ from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import read_summary
-from gsparc.models.parts import LAST, leaves
+from gsparc.models.fitting import LAST, leaves
 
 log = logging.getLogger(__name__)
 

@@ -18,8 +18,8 @@ from gsparc.data.instantiate import find
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.evaluation.console import config_folder
-from gsparc.models.method import Method, TrainsByGradient
-from gsparc.models.parts import leaves
+from gsparc.models.fitting import leaves
+from gsparc.models.method import Method, MethodFactory
 
 log = logging.getLogger(__name__)
 
@@ -65,8 +65,8 @@ def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]
             return
 
 
-def noting(config: DictConfig, method: Method) -> Reads:
-    """What is to be noted of the options that were `given` to a method that `config.model` describes."""
+def noting(config: DictConfig, method: MethodFactory) -> Reads:
+    """What is to be noted of the options that were `given` to what `config.model` describes."""
     options = []
     for path in given():
         group, _, name = path.rpartition(".")
@@ -77,7 +77,7 @@ def noting(config: DictConfig, method: Method) -> Reads:
     return Reads(options)
 
 
-def _holders(path: str, node: DictConfig, method: Method) -> Iterator[tuple[type, str]]:
+def _holders(path: str, node: DictConfig, method: MethodFactory) -> Iterator[tuple[type, str]]:
     """Classes and attributes that hold a setting, none where this is not known."""
     group, _, name = path.rpartition(".")
     stored = method.stored_names.get(path.removeprefix("model."))
@@ -87,7 +87,7 @@ def _holders(path: str, node: DictConfig, method: Method) -> Iterator[tuple[type
     as_named = group == "model" and stored is None and vars(method).get(name, ...) == node[name]
     if as_named or name in getattr(kind, "__dataclass_fields__", ()):
         yield kind, name
-    if stored:
+    if stored is not None:  # "" is the name of nothing that is read
         owner, _, attribute = stored.rpartition(".")
         yield type(getattr(method, owner) if owner else method), attribute
 
@@ -104,7 +104,6 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     counted = {"budget_s": method.takes_budget, "stations": stations}
     reads.noted |= {name for name, heeded in counted.items() if heeded}
     known = {option.path for option in reads.options}
-    known |= {f"model.{name}" for name, stored in method.stored_names.items() if not stored}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in given().items():
         judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
@@ -137,7 +136,7 @@ def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str
         (training and "trainer" in noted, "this training does not call for it"),
         (training and {"model.steps", "trainer.max_steps"} & noted, STEPS),
         (training, f"{method.name} takes no gradient steps here: model=splat does"),
-        (rendered and isinstance(method, TrainsByGradient), "of rendered Gaussians alone: say model=splat"),
+        (rendered, "of rendered Gaussians alone: say model=splat"),
         (started is not None, f"here it is init={started}"),
     )
     return next((text for holds, text in reasons if holds), f"{method.name} does not use it here")

@@ -17,12 +17,12 @@ from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, once
-from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.results import under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
-from gsparc.models.method import Method
+from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import displaced as elsewhere
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext
@@ -109,7 +109,7 @@ class Study:
     """What is compared.
 
     Attributes:
-        variants: what makes an unfitted method, by name, in the order of the table.
+        variants: what makes a method, or what chooses it, by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
         base: name of the variant that times are compared with; None: no ratios.
         rounds: trainings of each, in turns; round r uses seed + r.
@@ -117,7 +117,7 @@ class Study:
         clock: of the queries.
     """
 
-    variants: Mapping[str, Callable[[], Method]]
+    variants: Mapping[str, Callable[[], MethodFactory]]
     conditions: Sequence[Condition] = (Condition(),)
     base: str | None = None
     rounds: int = 1
@@ -191,7 +191,7 @@ class Study:
                     replace(context, run_dir=learned.model(folder).parent, seed=seed), split
                 )
                 learned_from = partial(learned.learned_from, seed=seed)
-                made = fit_folds(self.variants[variant], data, split, contexts, learned=learned_from)
+                made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
                 fits[learned] = made.scored_on(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
                 # Without the configuration of the study: a variant has other settings.
@@ -222,7 +222,7 @@ class Study:
         rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         methods = {
-            file: loading.made_again(self.variants[variant], checkpoint.read(file))
+            file: loading.made_again(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)

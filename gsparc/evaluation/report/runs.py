@@ -18,7 +18,7 @@ from gsparc.evaluation.baselines import BASELINES
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import rows_of
 from gsparc.evaluation.summary import read_summary, write_samples
-from gsparc.models.parts import leaves
+from gsparc.models.fitting import leaves
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training

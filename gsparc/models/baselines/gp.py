@@ -101,7 +101,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
 
 
-class GaussianProcess(Differentiable, ClosedForm, kind="process"):
+class GaussianProcess(Differentiable, ClosedForm):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows

@@ -49,7 +49,7 @@ NAMED = 6  # factors of runs that a note gives
 ANY = Slot(0, (), (), torch.zeros(3), torch.zeros(3), 0.0)  # kernels know of no end
 
 
-class ComplexGP(ClosedForm, kind="aligned"):
+class ComplexGP(ClosedForm):
     """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid.
 
     Where both ends move the covariance is the product of both ends'.

@@ -72,7 +72,7 @@ class Weights:
         return (cross.conj() @ self.root.T).abs().square().sum(1)
 
 
-class ChannelField(ClosedForm, kind="diffuse"):
+class ChannelField(ClosedForm):
     """Leakage, direct wave, images and a diffuse field of a static end and one that moves.
 
     Args:

@@ -38,7 +38,7 @@ VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entr
 SELECTION_ROWS = 700  # rows that the kernel is chosen on
 
 
-class DirectionalGP(SourcesInFrame, kind="rays"):
+class DirectionalGP(SourcesInFrame):
     """Gaussian process on channels of a moving receiver with measured directions; queries need none.
 
     Args:

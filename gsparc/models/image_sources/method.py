@@ -46,7 +46,7 @@ LOOKED_AT = 200  # rows of the group that a search leaves out, after each round
 ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
 
 
-class ImageSourceGP(SourcesInFrame, kind="sources"):
+class ImageSourceGP(SourcesInFrame):
     """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:

@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+import copy
 import logging
-from collections.abc import Iterator, Sequence
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_inside
+from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
+from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
-from gsparc.models.method import Prediction
-from gsparc.models.mixture import solutions
+from gsparc.models.each_or_together import LearnsTogether
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, Reducible
+from gsparc.models.mixture import fit_candidates
+from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import comparable, explained
+from gsparc.models.reduced import ReducedByPart
+from gsparc.models.refined_places import displaced, errors_of, refined
+from gsparc.models.run_factors import RunFactors
+from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
+from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import less_repeatable
@@ -28,41 +43,129 @@ from gsparc.training.time_budget import less_repeatable
 log = logging.getLogger(__name__)
 
 
-class Mixture(ClosedForm):
-    """The weighed mean of members: no single one need be the right one.
+class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
+    """The weighed mean of solutions whose weights follow from the rows: no single one need be the right one.
+
+    Initialisers find them, held-out groups weigh them. Subclasses say what is solved for which kind of site.
 
     Args:
-        init: settings of candidates.
         effects: switches of terms, of which `visibility` and `residual` are heeded.
+        position_std: of each coordinate of training positions [m]; None: as the data say.
+        init: where sources come from, and how many searches find them.
+        residual_alone: whether no sources are asked for.
     """
 
-    has_gaussians = True
+    has_gaussians = resumable = True
+    stored_names: ClassVar[dict[str, str]] = {"position_std": ""}
 
-    def __init__(self, init: InitSettings, effects: EffectSettings) -> None:
-        self.init, self.switches = init, effects
+    def __init__(
+        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
+        init: InitSettings | None = None, residual_alone: bool = False,
+    ) -> None:  # fmt: skip
+        check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
+        self.switches, self.init = effects, init or InitSettings()
+        self.position_std, self.residual_alone = position_std, residual_alone
+        self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
         self.explained: float | None = None  # share of the variance of validation rows, by Gaussians
         self.init_s: float | None = None
 
-    def fit_members(
-        self, names: Sequence[str], init: InitSettings, data: Measurements, fold: Fold, context: FitContext
-    ) -> FitReport:
-        """Fit candidates by name, weigh several by rows held out, and condition them on all rows.
+    @abstractmethod
+    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+        """Candidates by name, weighed where they are several."""
+
+    @abstractmethod
+    def obstacle(self, data: Measurements) -> str | None:
+        """Why this cannot be solved for such measurements; None where it can."""
+
+    @property
+    def plain(self) -> bool:
+        """Whether a plain process may stand in, or beside."""
+        return self.switches.residual is not False
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Initialise, weigh, and solve for all rows; where places have errors, again where they rather are.
+
+        Raises:
+            ValueError: these measurements are of another kind, or the only initialiser cannot solve this.
+        """
+        self.site, self.runs = data.site, RunFactors.none()
+        with heeded.apart():
+            if (why := self.obstacle(data)) is not None:
+                raise ValueError(f"{self.name}: {why}")
+            parts = self.tries(data)
+            named = self.init.name in ("auto", "diffuse", *parts)
+            name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
+            init = replace(self.init, name=name)
+        heeded.count(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
+        if "scene" in parts:
+            read_walls(self.init.file)  # its errors come before anything is computed
+        site, phases = data.site, data.site.phase_reference != "neighbours"
+        heeds = site.kind != "spectrum" and site.static_end is not None and phases
+        known = np.concatenate([fold.train, fold.val])
+        if (std := errors_of(data, known, self.position_std, heeds)) is not None:
+            return self._fit_refined(parts, init, data, fold, context, std)
+        return self._solve(parts, init, data, fold, context)
+
+    def _fit_refined(
+        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
+        context: FitContext, std: np.ndarray,
+    ) -> FitReport:  # fmt: skip
+        """First where rows were measured, then where they rather were."""
+        budget = context.time_budget()
+        first = replace(context, run_dir=Path(), resume=None)
+        report = self._solve(parts, init, data, fold, first)
+        rows, by, note = refined(self, self.runs.aligned(data), std)
+        if by.any() and budget.over():
+            note = f"{note}, but the seconds are over: they stay as measured"
+        log.info("%s", note)
+        if not by.any() or budget.limited:
+            return replace(report, notes=(note, *report.notes))
+        limited, spent = report.limited_by, budget.counted.wall
+        rest = replace(context, budget_s=budget.left_s)
+        report = self._solve(parts, init, displaced(data, rows, by), fold, rest)
+        limited = less_repeatable(limited, report.limited_by)
+        cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
+        notes = (note, *report.notes)
+        return replace(report, seconds=spent + report.seconds, notes=notes, limited_by=limited, cost=cost)
+
+    def _solve(
+        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
+        context: FitContext,
+    ) -> FitReport:  # fmt: skip
+        """Fit and weigh candidates, of channels of several runs in the phase and level of one."""
+        budget, known = context.time_budget(), np.sort(np.concatenate([fold.train, fold.val]))
+        self.runs = _runs(data, known, context)
+        aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
+        within = replace(context, budget_s=budget.left_s)
+        report = self._fit_members(parts, init, self.runs.aligned(data), fold, within)
+        if not aligning:
+            return report
+        cost = Cost({"factors of runs": aligning}) + report.cost
+        return replace(report, seconds=report.seconds + aligning, cost=cost)
+
+    def _fit_members(
+        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
+        context: FitContext,
+    ) -> FitReport:  # fmt: skip
+        """Fit candidates, weigh several by rows held out, and condition them on all rows.
 
         Raises:
             ValueError: the only candidate, or the one asked for, cannot solve this.
         """
         budget = context.time_budget()
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
-        log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(names), end)
-        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(names) > 1
-        cut = cut_inside(data, fold, context.split, solutions.GROUPS, context.seed) if several else None
-        found, reports, read = solutions.find(
-            tuple(names), init, self.switches, data, fold, context, budget, cut
+        log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
+        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
+        cut = cut_inside(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
+        found, reports, read = fit_candidates.fit_all(
+            parts, init, self.switches, data, fold, context, budget, cut
         )
-        chosen = solutions.weighed(found, data, fold, cut)
+        chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
         heeded.count(*(path for name in chosen for path in read[name]))
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
@@ -102,8 +205,25 @@ class Mixture(ClosedForm):
         for member in self.members:
             member.condition(data, rows)
 
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
+        if self.only is None or not self.only.forgets:
+            return None
+        result = copy.deepcopy(self)
+        result.condition(data, rows)
+        return result
+
+    # -- answering ---------------------------------------------------------------------------------
+
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; what members disagree about is added to their variances."""
+        if not self.members:
+            raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+        told = Prediction.joined([self._mean(part) for part in query.split(QUERY_CHUNK)])
+        return self.runs.restored(told, query.run)
+
+    def _mean(self, query: Query) -> Prediction:
+        """In the phase and level of the largest run."""
         result = [member.predict(query) for member in self.members]
         if len(result) == 1:
             return result[0]
@@ -129,15 +249,34 @@ class Mixture(ClosedForm):
         variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)
         return LeftOutRows(result[0].rows, mean, variance)
 
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return self.only.process() if isinstance(self.only, HasProcess) else None
+
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+        """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
+
+        What other solutions and the residual add to channels is in no path.
+        """
+        made = [(weight, one) for weight, one in self.parts() if isinstance(one, HasPaths)]
+        if not made:
+            raise ValueError("its channels are not made of paths")
+        result = [(weight, method.paths(query)) for weight, method in made]
+        gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
+        delay = torch.cat([one[1] for _, one in result], dim=2)
+        return gain, delay, torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
+
+    # -- what it is made of --------------------------------------------------------------------------
+
     @property
     def only(self) -> ClosedForm | None:
         """Return the member, where it is one."""
         return self.members[0] if len(self.members) == 1 else None
 
     @property
-    def forgets(self) -> bool:  # type: ignore[override]
-        """See `ClosedForm`."""
-        return self.only is not None and self.only.forgets
+    def reducible(self) -> Method | None:
+        """See `ReducedByPart`; what answers faster knows nothing of runs' factors."""
+        return self.only if len(self.runs) == 1 and isinstance(self.only, Reducible) else None
 
     def parts(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""
@@ -145,34 +284,63 @@ class Mixture(ClosedForm):
             yield from ((weight * more, part) for more, part in one.parts())
 
     @property
-    def count(self) -> int:
-        """Gaussians of all members."""
-        return sum(member.count for member in self.members)
-
-    def size(self) -> int:
-        """See `count`."""
-        return self.count
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return self.name if self.only is None else self.only.label.replace(self.only.name, self.name, 1)
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Terms of any member."""
         return tuple(dict.fromkeys(term for one in self.members for term in one.terms))
 
+    @property
+    def effects(self) -> str:  # type: ignore[override]
+        """The terms that are computed, for `summary.json`."""
+        return "+".join(self.terms) or "residual"
+
+    @property
+    def made(self) -> str:
+        """See `Method`."""
+        terms = ", ".join(self.terms) or "a process alone"
+        return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
+
+    def size(self) -> int:
+        """Gaussians of all members."""
+        return sum(member.count for member in self.members)
+
     def objects(self) -> SiteObjects:
         """Those of the heaviest member that found any."""
         result = [self.members[i].objects() for i in np.argsort(self.weights)[::-1]]
         return next((one for one in result if len(one)), result[0])
 
+    def facts(self) -> dict[str, float | int | str | None]:
+        """See `Method.facts`."""
+        return super().facts() | {
+            "model/init": self.started, "model/variance_explained": self.explained,
+            "model/steps": 0, "model/steps_taken": 0, "time/init_s": self.init_s,
+        }  # fmt: skip
+
+    # -- storing -----------------------------------------------------------------------------------
+
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        members = [stored(member) for member in self.members]
         return {
-            "members": members, "weights": list(self.weights), "started": self.started,
-            "explained": self.explained,
+            "members": [stored(member) for member in self.members], "weights": list(self.weights),
+            "started": self.started, "explained": self.explained, "runs": self.runs.state(),
         }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.started, self.explained = site, str(state["started"]), state["explained"]
         self.members = [restored(site, member) for member in state["members"]]
-        self.weights = tuple(state["weights"])
+        self.weights, self.runs = tuple(state["weights"]), RunFactors.read(state["runs"])
+
+
+def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
+    """Factors of several runs of channels, by the waves that explain rows (n,); else none."""
+    if not RunFactors.several(data, known):
+        return RunFactors.none()
+    waves = ChannelField()
+    waves.fit(data, Fold(known, known[:0], known[:0]), context)
+    log.info("channels of %d runs: the factor of each was estimated with the waves' field", len(waves.runs))
+    return waves.runs

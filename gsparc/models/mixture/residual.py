@@ -19,14 +19,14 @@ from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Blended, contributions, knobs, reduced
+from gsparc.models.reduced import Blended, ReducedByPart
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import less_repeatable
 
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
-class Residual(ClosedForm, kind="residual"):
+class Residual(ReducedByPart, ClosedForm):
     """The sum of a method and a share of a process, conditioned on left-out residuals.
 
     Of several tones or antennas there is no process: one of them is kept of rows left out.
@@ -107,18 +107,17 @@ class Residual(ClosedForm, kind="residual"):
         """The method's."""
         return self.method.objects()
 
-    def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
-        return knobs(self.method)
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """See `Reducible`."""
-        return contributions(self.method, data, rows)
+    @property
+    def reducible(self) -> Method:
+        """See `ReducedByPart`."""
+        return self.method
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`; the process stays as it is."""
-        result = reduced(self.method, settings, measured)
-        return result if self.rest is None else Blended(result, self.rest.predict, self.share)
+        result, share = super().reduced(settings, measured), self.share
+        if self.rest is None:
+            return result
+        return Blended(result, self.rest.predict, lambda own, rest: torch.add(own, rest, alpha=share))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

@@ -29,7 +29,7 @@ LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
 def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[float, ...]:
-    """Weights in [0, 1] of sum one: of one alone, unless a mixture is surely better; see `choose`.
+    """Weights in [0, 1] of sum one: of one alone, unless a mixture is surely better; see `choose_weights`.
 
     Args:
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
@@ -37,7 +37,7 @@ def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[
         unit: (n,), rows of one unit are not independent.
     """
     missed = torch.stack([real((one - target).detach()) for one in predicted], 1)  # (n, M, P)
-    chosen = choose((missed @ missed.mT).numpy(), unit)
+    chosen = choose_weights((missed @ missed.mT).numpy(), unit)
     return tuple(float(weight) for weight in chosen)
 
 
@@ -96,6 +96,13 @@ def comparable(values: Tensor, site: Site) -> Tensor:
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
+def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
+    """Return the mean (n, ...) of two predictions in the unit of `comparable`, the other's of this weight."""
+    if site.kind != "rssi":
+        return own.lerp(other, weight)
+    return own.clamp_min(1e-30) ** (1 - weight) * other.clamp_min(1e-30) ** weight
+
+
 def real(values: Tensor) -> Tensor:
     """Entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
@@ -129,7 +136,7 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
-def choose(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
+def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """Weights (K,) of the predictions: one alone, unless a mixture is better by more than a standard error.
 
     The mixture is judged on units whose rows its weights were not learned from.

@@ -70,7 +70,7 @@ class Spectra:
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
-class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
+class MovingArrayField(Differentiable, ClosedForm):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
     It searches until the leave-one-out error stops falling, the searches are done or the seconds are over.

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.fit import run_stage, steps_asked_for
+from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
 from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
+from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
-from gsparc.models.parts import Origin
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport

@@ -41,7 +41,7 @@ from gsparc.training.time_budget import TimeBudget
 QUERIES = 512  # at a time: memory
 
 
-class PowerField(ClosedForm, kind="powers"):
+class PowerField(ClosedForm):
     """Powers of one station, (1,) linear, by settings of the largest left-out likelihood.
 
     Args:

@@ -18,8 +18,7 @@ class ArrayField(LearnedField):
     """
 
     effects = "array"
-    takes_budget = False
-    resumable = False
+    takes_budget = takes_weights = resumable = False  # it is solved in closed form
 
     def __init__(
         self, field: FieldSettings = FieldSettings(count=128), refit: bool = True, name: str = "array"
@@ -32,7 +31,3 @@ class ArrayField(LearnedField):
             name=name,
             steps=0,
         )
-
-    def trainer_options(self) -> bool:
-        """See `TrainsByGradient`: it is solved in closed form."""
-        return False

@@ -25,25 +25,25 @@ from gsparc.field import edit
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel, fit_errors
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
-from gsparc.field.fit import run_stage, steps_asked_for
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
+from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import InitSettings, InitTask
-from gsparc.field.keep_best import KeepBest, StopAt
+from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.module import GaussianModule, LossSettings, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
+from gsparc.models.fitting import Origin
 from gsparc.models.in_double import in_double
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.weights import LEAST_HELD
-from gsparc.models.parts import Origin
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, resolve, settled
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.models.splat.closed_form import prepare
+from gsparc.models.splat.closed_form_start import prepare
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
@@ -67,14 +67,15 @@ class LearnedField(Method):
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best look at validation rows, the start among them.
         steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60 after a
-            start in closed form, else 400. 0 of either is the start alone.
+            start in closed form, else 400, fewer where the first looks show no gain (`KeepBest`). 0 of
+            either is the start alone.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
     effects = "image"
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
-    takes_budget = True
+    takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
@@ -161,7 +162,11 @@ class LearnedField(Method):
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
-                seconds += self._stage("train", origin, data, watched, context, budget, seconds, steps)
+                # Steps that somebody asks for are all taken.
+                patience = PATIENCE if asked is None else None
+                seconds += self._stage(
+                    "train", origin, data, watched, context, budget, seconds, steps, patience
+                )
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
@@ -178,7 +183,7 @@ class LearnedField(Method):
             again = context.within("refit", resume=resume)
             known = self.fitted().confidence, self.fitted().error
             kept = self.model, self.steps, self._prior
-            self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
+            self._stage("refit", origin, data, every, again, budget, seconds, steps, None, *known)
             if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
         return self._ended(context, budget)
@@ -207,7 +212,7 @@ class LearnedField(Method):
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, earlier_s: float, steps: int,
+        budget: TimeBudget, earlier_s: float, steps: int, patience: int | None = None,
         confidence: Confidence | None = None, error: ErrorModel | None = None,
     ) -> float:  # fmt: skip
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
@@ -215,6 +220,7 @@ class LearnedField(Method):
         Args:
             stage: `train`, `refit` or `final`, which takes no steps.
             steps: of the schedule.
+            patience: see `KeepBest`.
             confidence, error: of an earlier stage, told by rows that this one learns from.
         """
         folder, resume = context.run_dir, context.resume
@@ -269,7 +275,7 @@ class LearnedField(Method):
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         watch: list[L.Callback] = []
         if self.keep_best and stage == "train":
-            watch.append(KeepBest())
+            watch.append(KeepBest(patience))
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
         heeded.count("dataset.batch_size")
@@ -340,10 +346,10 @@ class LearnedField(Method):
         """The trained model.
 
         Raises:
-            RuntimeError: before `fit` or `restore`.
+            ValueError: before `fit` or `restore`.
         """
         if self.model is None:
-            raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+            raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         return self.model
 
     @property
@@ -412,10 +418,6 @@ class LearnedField(Method):
         return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
-
-    def trainer_options(self) -> bool:
-        """See `TrainsByGradient`."""
-        return True
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""

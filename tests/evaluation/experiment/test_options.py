@@ -1,7 +1,6 @@
 """Every option is heeded or named: tiny fits of each method on each kind of data, and options perturbed."""
 
-from copy import deepcopy
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -19,7 +18,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.fit import context_of, fit_folds
+from gsparc.evaluation.experiment.folds import context_of, fit_folds
 from gsparc.models.registry import build, complete
 
 WORLDS = {
@@ -55,7 +54,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             split = split_for(plain(config.split), data)
             folder = Path(mkdtemp())
             fits = fit_folds(
-                partial(deepcopy, method), data, split,
+                method, data, split,
                 [context_of(config, run_dir=folder)] * len(split.folds),
             )  # fmt: skip
             method, rows = fits.methods[0], split.folds[0].test

@@ -1,5 +1,7 @@
 """Each variant's accuracy, seconds and milliseconds beside the base's, under every condition of the data."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from clocks import WoundClock
@@ -8,7 +10,7 @@ from invented import divide, invent
 from gsparc.data.query import Batch
 from gsparc.evaluation.experiment import study
 from gsparc.evaluation.experiment.done import State
-from gsparc.evaluation.experiment.fit import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, in_folders
 from gsparc.evaluation.experiment.study import Measured, Positions, Study, facts_of
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
@@ -30,7 +32,7 @@ def run(monkeypatch, tmp_path):
         study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
     )
     monkeypatch.setattr(study.checkpoint, "read", kept.get)
-    monkeypatch.setattr(study.loading, "made_again", lambda make, stored: stored)
+    monkeypatch.setattr(study.loading, "made_again", lambda factory, stored: stored)
     context = FitContext(tmp_path, seed=5, budget_s=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 
@@ -40,10 +42,11 @@ class Slow(Nearest):
 
     effects = "sleep"
     seconds, query_s = 3.0, 0.004
+    contexts: ClassVar[list] = []
 
     def fit(self, data, fold, context):
         super().fit(data, fold, context)
-        self.context = context
+        self.contexts.append(context)
         return FitReport(self.seconds)
 
     def predict(self, query):
@@ -91,16 +94,12 @@ def test_the_base_must_be_there(run):
 
 
 def test_every_fit_gets_the_context_and_every_round_another_seed_once(run):
-    found = []
-
-    def make():
-        found.append(Quick())
-        return found[-1]
-
+    Quick.contexts.clear()
     for _ in range(2):  # the second time every round is done
-        run(Study(dict(quick=make), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
-    assert [m.context.seed for m in found] == [3, 3, 4, 4] and {m.context.budget_s for m in found} == {7.0}
-    assert len({m.context.run_dir for m in found}) == 4
+        run(Study(dict(quick=Quick), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
+    assert [one.seed for one in Quick.contexts] == [3, 3, 4, 4]
+    assert {one.budget_s for one in Quick.contexts} == {7.0}
+    assert len({one.run_dir for one in Quick.contexts}) == 4
 
 
 def test_errors_cost_an_interpolator_and_not_the_mean(run):
@@ -130,9 +129,8 @@ def test_more_measurements_are_better_and_are_counted(run):
 def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
     data, split = invent("csi"), divide(48, 3)
     kept = []
-    fits = fit_folds(
-        Nearest, data, split, in_folders(FitContext(tmp_path), split), keep=lambda *given: kept.append(given)
-    )
+    contexts = in_folders(FitContext(tmp_path), split)
+    fits = fit_folds(Nearest(), data, split, contexts, keep=lambda *given: kept.append(given))
     assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
     found = fits.scored_on(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3

@@ -184,7 +184,7 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
     data = measure(site, walk(12), np.ones((12, 4), complex))
     with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
         ArrayField(SMALL).fit(data, _fold(12), FitContext(tmp_path))
-    with pytest.raises(RuntimeError, match="not been trained"):
+    with pytest.raises(ValueError, match="not been trained"):
         ArrayField().predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
 
 

@@ -131,7 +131,9 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     data, _ = known_campaign
     found = splat_init.learn(data, np.arange(20), 1024, 0, tmp_path)
     method, _, _ = trained
-    model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
+    model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model).made_for(
+        data
+    )
     model.restore(data.site, method.state())
     with torch.no_grad():
         model.fitted().gaussians.opacity_logits.fill_(-40.0)

@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
-from gsparc.models.mixture.named import ImageSources
+from gsparc.models.mixture.methods import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 from gsparc.training.race import Behind, Race
@@ -231,7 +231,7 @@ def learned_and_true_visibility(method, told, data, index, most=6):
     sources = (member.scene.sources + method.frame.middle).numpy() + data.site.origin
     true = told.images.of(told.tx[0])
     learned, seen = [], []
-    for i in np.argsort(told.images.order, kind="stable"):
+    for i in np.argsort(told.images.order):
         distance = np.linalg.norm(sources - true[i], axis=-1)
         if distance.min() < 0.5 * WAVELENGTH and len(learned) < most:
             full = abs(told.images.gain[i]) * WAVELENGTH / (4 * np.pi)

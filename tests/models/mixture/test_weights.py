@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,11 @@ import torch
 from gsparc.models.mixture.weights import (
     Rows,
     best_weights,
-    choose,
+    choose_weights,
+    comparable,
     error,
     explained,
+    mixed,
     paired,
     share_of_second,
     squared,
@@ -44,8 +48,15 @@ def test_complex_predictions_are_weighed_as_they_are_summed():
     other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
     target = torch.complex(TARGET, TARGET)
     found = weights([turned, other], target, EACH)
-    mixed = found[0] * turned + found[1] * other
-    assert error(mixed, target) < min(error(turned, target), error(other, target))
+    both = found[0] * turned + found[1] * other
+    assert error(both, target) < min(error(turned, target), error(other, target))
+
+
+def test_powers_that_are_weighed_in_decibels_were_averaged_as_such():
+    site = SimpleNamespace(kind="rssi")
+    own, other = torch.tensor([1e-6]), torch.tensor([1e-10])
+    assert float(comparable(mixed(own, other, 0.25, site), site)) == pytest.approx(-70)
+    assert float(mixed(own, other, 0.25, SimpleNamespace(kind="csi"))) == pytest.approx(0.75e-6, rel=1e-4)
 
 
 def test_silent_targets_still_give_weights():
@@ -129,7 +140,7 @@ def test_rows_of_one_unit_count_as_one():
 
 def test_a_mixture_is_taken_where_it_pays():
     errors = drawn([1.0, 1.05])
-    weights = choose(gram_of(errors), np.arange(400))
+    weights = choose_weights(gram_of(errors), np.arange(400))
     assert weights == pytest.approx([0.5, 0.5], abs=0.1)
     assert squared(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
 
@@ -138,11 +149,11 @@ def test_a_mixture_is_taken_where_it_pays():
 def test_one_alone_is_taken_where_a_mixture_does_not_pay_clearly(deviations, common):
     """The other is much worse, or both err alike."""
     errors = drawn(deviations, 60, common)
-    weights = choose(gram_of(errors), np.arange(60))
+    weights = choose_weights(gram_of(errors), np.arange(60))
     assert sorted(weights) == [0.0, 1.0]
     assert weights.argmax() == (errors**2).mean(0).argmin()
 
 
 def test_small_weights_are_left_out():
-    weights = choose(gram_of(drawn([1.0, 1.0, 6.0], 4000)), np.arange(4000))
+    weights = choose_weights(gram_of(drawn([1.0, 1.0, 6.0], 4000)), np.arange(4000))
     assert weights[2] == 0 and weights.sum() == pytest.approx(1)

@@ -18,8 +18,8 @@ from scenes import lobes, room
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.evaluation.experiment.fit import callbacks_of
-from gsparc.field.fit import DEFAULTS
+from gsparc.evaluation.experiment.folds import callbacks_of
+from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import HasGaussians

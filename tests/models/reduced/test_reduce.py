@@ -213,7 +213,6 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
 
 def own_copy(case):
     method = copy.copy(case.method)
-    method.chosen = copy.copy(method.chosen)
     return case._replace(method=method)
 
 
@@ -221,14 +220,14 @@ def test_what_a_process_beside_adds_stays(field):
     both = own_copy(field)
     plain = both.answer(both.less(stride=2)).mean
     beside = SimpleNamespace(predict=lambda query: SimpleNamespace(mean=torch.ones_like(plain)))
-    both.method.chosen._average = (beside, 0.25)
+    both.method._average = (beside, 0.25)
     assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 
 
 @pytest.mark.parametrize("stride", [1, 2])
 def test_a_process_beside_spares_pixels_with_the_field(field, process, stride):
     both = own_copy(field)
-    both.method.chosen._average, both.method.chosen._average_mean = (process.method, 0.5), None
+    both.method._average, both.method._average_mean = (process.method, 0.5), None
     spared = process.answer(process.less(confidence=False, stride=stride)).mean
     wanted = 0.5 * field.answer(field.less(stride=stride)).mean + 0.5 * spared
     found = both.answer(both.less(stride=stride, confidence=True)).mean

@@ -21,7 +21,7 @@ from gsparc.ops import Pose
 
 
 def learned(file, *more: str) -> LearnedField:
-    return build(compose(*brief(file, *more)).model)
+    return build(compose(*brief(file, *more)).model).made_for(load_data({"name": "own", "file": str(file)}))
 
 
 def fitted(file, run_dir, *more: str, steps: int = 15, every: int | None = None):
@@ -175,7 +175,7 @@ def test_seeds_repeat_and_differ(tmp_path):
 
 
 def test_untrained_says_so():
-    with pytest.raises(RuntimeError, match="has not been trained"):
+    with pytest.raises(ValueError, match="has not been trained"):
         LearnedField().fitted()
 
 

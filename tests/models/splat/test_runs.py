@@ -32,7 +32,9 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
         "logger=none",
         "threads=1",
     ]
-    facts, objects = train(compose(*said, "budget_s=4", "baselines=[complex_gp]"), tmp_path / "run")
+    facts, objects = train(
+        compose(*said, "budget_s=4", "budget_clock=processor", "baselines=[complex_gp]"), tmp_path / "run"
+    )
     assert facts["test/nmse"] < 1.1 * facts["baseline/complex_gp/nmse"] < 0.5
     data, method = objects.data, objects.methods[0]
     rows = objects.split.folds[0].test
@@ -46,7 +48,7 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
 def test_both_ends_may_move_in_channels():
     data = from_arrays(arrays(World("antennas", 1, 1, "both", "metres", "none", "random", 300), 0))
     split = split_for({"name": "random"}, data)
-    method = Gsparc()
+    method = Gsparc().made_for(data)
     method.fit(data, split.folds[0], FitContext(budget_s=5.0))
     own, plain = score([method], data, split).figures(), baseline("gp", data, split).scores.figures()
     assert own["nmse"] < 0.9 * plain["nmse"] and "direct" in method.effects

@@ -17,16 +17,15 @@ from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
-from gsparc.models.mixture.named import NamedMixture
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
-from gsparc.models.splat.averaged import ImageProcess
+from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -103,9 +102,7 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 
 def exact_form(method: Method, site: Site) -> Form | None:
     """The form whose answers are the model's but for rounding; None where there is none."""
-    if isinstance(method, Gsparc):
-        return exact_form(method.chosen, site)
-    if isinstance(method, NamedMixture):
+    if isinstance(method, Mixture):
         return None if method.only is None else exact_form(method.only, site)
     if isinstance(method, Residual):
         return exact_form(method.method, site) if method.rest is None or not method.share else None
@@ -145,7 +142,6 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
         ValueError: channels that are not made of sources.
     """
     method, site = predictor.method, predictor.site
-    method = method.chosen if isinstance(method, Gsparc) else method
     if isinstance(method, ImageProcess) and method._average is not None:
         own_form = _rendered(method, site)  # without the process that it is averaged with
         if own_form is not None:

@@ -54,6 +54,11 @@ class KnownWallsGP(ImageSourceGP):
         self.walls = walls
         self.kernel = KERNEL if self.settings.clutter else KernelVisibility()
 
+    @property
+    def stored_as(self) -> type[ImageSourceGP]:
+        """See `Method`; what was found needs no walls to answer."""
+        return ImageSourceGP
+
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
         look: Look | None = None,

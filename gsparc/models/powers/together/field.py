@@ -42,7 +42,7 @@ PLACES = 600  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
-class JointPowerField(ClosedForm, kind="joint_powers"):
+class JointPowerField(ClosedForm):
     """Powers of several stations, (1,) linear.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from gsparc.data.splits import Fold
 from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture import solutions
+from gsparc.models.mixture import fit_candidates
+from gsparc.models.mixture.weights import mixed
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import averaged, mean_alone
 from gsparc.models.splat.auto_settings import resolve
@@ -44,14 +46,8 @@ class ImageProcess(LearnedField):
         super().__init__(name=name, **field)
         self.plain = plain
         self.explained: float | None = None
-        self.chosen_by: type[Method] = type(self)  # as whose its checkpoints are read back
         self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
         self._average_mean: Method | None = None  # that process without its variance, made when first asked
-
-    @property
-    def stored_as(self) -> type[Method]:
-        """See `Method`."""
-        return self.chosen_by
 
     @property
     def effects(self) -> str:  # type: ignore[override]
@@ -60,12 +56,6 @@ class ImageProcess(LearnedField):
             return "residual"
         base = "array" if self.settings.response.array else "image"
         return base + ("+residual" if self._average is not None else "")
-
-    def called_for(self, array: bool, plain: bool) -> ImageProcess:
-        """Let Gaussians emit fields that the static receiver's array images, or images; return the method."""
-        self.settings = replace(self.settings, response=replace(self.settings.response, array=array))
-        self.plain, self.name = plain, "array_process" if array else "image_process"
-        return self
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -113,7 +103,8 @@ class ImageProcess(LearnedField):
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         if self.plain:
-            self._average, explained = solutions.weigh(self, data, fold, self._left_out, self._apart)
+            left = self._left_out, self._apart
+            self._average, explained = fit_candidates.weigh_process(self, data, fold, *left)
             self.explained = self.explained if explained is None else explained
 
     # -- answering ---------------------------------------------------------------------------------
@@ -128,9 +119,10 @@ class ImageProcess(LearnedField):
         if self._average_mean is None:
             self._average_mean = mean_alone(self._average[0])
         method, weight = self._average
-        if query.tx.dtype == torch.float64:
-            return replace(own, mean=own.mean.lerp(method.mean_at(query), weight))
-        return replace(own, mean=own.mean.lerp_(self._average_mean.predict(query).mean, weight))
+        exact = query.tx.dtype == torch.float64
+        other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
+        assert self.site is not None
+        return replace(own, mean=mixed(own.mean, other, weight, self.site))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -142,7 +134,11 @@ class ImageProcess(LearnedField):
         twin = copy.copy(self)
         twin._average = None
         result = LearnedField.reduced(twin, settings, measured)
-        return result if self._average is None else averaged(result, *self._average)
+        if self._average is None:
+            return result
+        assert self.site is not None
+        process, weight = self._average
+        return averaged(result, process, partial(mixed, weight=weight, site=self.site))
 
     def size(self) -> int:
         """Number of Gaussians."""

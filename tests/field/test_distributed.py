@@ -9,7 +9,7 @@ from invented import invent
 from several import Kill, trained
 from states import same
 
-from gsparc.field.processes import Processes, add_up, agreed, count
+from gsparc.field.distributed import Processes, add_up, agreed, count
 
 
 def test_strategies_that_share_batches_are_known_by_name():

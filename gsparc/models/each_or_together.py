@@ -15,7 +15,7 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import of_station
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
@@ -26,7 +26,7 @@ from gsparc.training.context import FitContext
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
 
 
-class LearnsTogether(Method):
+class LearnsTogether(MethodFactory):
     """Learns several stations of a site in one field, or each in its own."""
 
     both_ends = True
@@ -44,10 +44,10 @@ class LearnsTogether(Method):
         """See `Method.best_stations`."""
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
-        return best(data, fold, context)
+        return decide(data, fold, context)
 
 
-def best(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
+def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
     """How stations of a site that can be learned as one are best learned, and why.
 
     Channels share waves and where their stations really stand: together. Powers share little more than a

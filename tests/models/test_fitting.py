@@ -11,7 +11,7 @@ from posts import POSTS, heard
 from scenes import fold_of
 
 from gsparc.data import executor
-from gsparc.models import checkpoint, parts
+from gsparc.models import checkpoint, fitting
 from gsparc.models.baselines.nearest import Nearest
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.training.context import FitContext
@@ -39,7 +39,7 @@ def town():
 
 def fitted(town, folder, stop_at=0, **more):
     Resumable.fits, Resumable.stop_at = 0, stop_at
-    method = PerStation(Resumable)
+    method = PerStation(Resumable())
     method.fit(*town, FitContext(folder, **more))
     return method
 
@@ -57,6 +57,14 @@ def test_stations_were_mixed_up_and_done_again_by_a_resumed_run(town, tmp_path, 
     whole, batch = fitted(town, tmp_path / "whole"), town[0].batch(town[1].test)
     assert (again.predict(batch).mean == whole.predict(batch).mean).all()
     assert len(list((tmp_path / "on").glob("station*/model.ckpt"))) == 3  # it can be gone on from, too
+
+
+def test_a_folder_of_stations_that_were_finished_was_not_gone_on_from(town, tmp_path):
+    """Of a run's folder only its own `last.ckpt` was taken, which stations have in folders of their own."""
+    fitted(town, tmp_path / "run")
+    Resumable.fits = 0
+    fitting.fit(PerStation(Resumable()), *town, FitContext(tmp_path / "on", resume=tmp_path / "run"))
+    assert Resumable.fits == 0
 
 
 def test_a_part_is_not_taken_for_another(town, tmp_path):
@@ -81,11 +89,14 @@ def test_a_run_that_begins_anew_leaves_no_parts_of_the_one_before(town, tmp_path
 def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     data, fold = town
     context = FitContext(tmp_path / "fold0", stations="each")
-    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable), 0, 0
+    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
-    checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=parts.marks(report, data, fold, context))
-    again = PerStation(Resumable)
-    found = parts.fit(again, data, fold, replace(context, resume=tmp_path / "fold0"))
+    checkpoint.save(
+        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.marks(report, data, fold, context)
+    )
+    again, found = fitting.fit(
+        PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")
+    )
     assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
 
 
@@ -108,7 +119,7 @@ def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
 def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
     (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
-    assert parts.folder_of(tmp_path / given, parts.FOLDS) == tmp_path / found
+    assert fitting.folder_of(tmp_path / given, fitting.FOLDS) == tmp_path / found
 
 
 @pytest.mark.parametrize(
@@ -121,4 +132,4 @@ def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     ],
 )
 def test_several_fits_are_named_by_what_most_say(labels, found):
-    assert parts.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found
+    assert fitting.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found

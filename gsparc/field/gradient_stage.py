@@ -23,9 +23,9 @@ from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.distributed import Processes
 from gsparc.field.module import NetworkModule
-from gsparc.field.pace import SPENT, Budget
-from gsparc.field.processes import Processes
+from gsparc.field.stage_budget import SPENT, Budget
 from gsparc.training.context import FitContext
 from gsparc.training.time_budget import Spent, TimeBudget
 

@@ -20,9 +20,9 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.intervals import pooled
 from gsparc.evaluation.scores import score
-from gsparc.models import parts
-from gsparc.models.method import Method
-from gsparc.models.per_station import for_links
+from gsparc.models import fitting
+from gsparc.models.method import Method, MethodFactory
+from gsparc.models.per_station import for_stations
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, less_repeatable
@@ -94,7 +94,7 @@ def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
 
 
 def fit_folds(
-    make: Callable[[], Method],
+    factory: MethodFactory,
     data: Measurements,
     split: Split,
     contexts: Sequence[FitContext],
@@ -105,7 +105,7 @@ def fit_folds(
     """Fit an unfitted method on every fold; `Outcome.scored_on` scores them together.
 
     Args:
-        make: an unfitted method.
+        factory: an unfitted method, or what chooses one.
         data, split: learned from `train` and `val` of each fold.
         contexts: of each fold's fit.
         learned: what is learned from instead, such as displaced or fewer measurements.
@@ -121,8 +121,8 @@ def fit_folds(
     def fitted(number: int) -> tuple[Method, FitReport, float]:
         fold = split.folds[number]
         there, rows = (data, fold) if learned is None else learned(data, fold)
-        method, before = for_links(make, there), time.process_time()
-        report = parts.fit(method, there, rows, contexts[number])
+        before = time.process_time()
+        method, report = fitting.fit(for_stations(factory, there), there, rows, contexts[number])
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}

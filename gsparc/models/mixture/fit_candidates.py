@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
-from gsparc.models.mixture.candidates import CANDIDATES
+from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
@@ -40,9 +41,9 @@ CLUTTERED = ("sources", "scene", "joint_powers")  # candidates to which `clutter
 SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
 
 
-def find(
-    parts: tuple[str, ...], init: InitSettings, effects: EffectSettings, data: Measurements, fold: Fold,
-    context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
+def fit_all(
+    parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
+    fold: Fold, context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
 ) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
     """Fit candidates; return them, what each cost, and which settings each read.
 
@@ -52,7 +53,7 @@ def find(
     others better, few of them what is far.
 
     Args:
-        parts: names in `CANDIDATES`, which have settings `init`.
+        parts: candidates by name, which have settings `init`.
         fold: validation rows are solved for, too, where nothing is weighed.
         budget: running; what is left of it ends each.
         cut: how training rows are cut; None of one initialiser.
@@ -92,8 +93,7 @@ def find(
             within = replace(within, leave_out=leave_out, race=race)
             with heeded.apart() as read[name], late_when(budget.over):
                 clutter = part not in CLUTTERED or effects.visibility is not False
-                kind = "powers" if part == "scene" and data.site.kind == "rssi" else part
-                field = CANDIDATES[kind](settings, clutter, effects.residual is not False, within)
+                field = parts[part](settings, clutter, effects.residual is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
             if part not in OPEN_ENDED:
@@ -131,7 +131,7 @@ def _reached(race: Race | None) -> str | None:
     return f"another solution has an NMSE of {race.error:.4f} on held-out rows"
 
 
-def weighed(
+def weigh_candidates(
     solutions: dict[str, ClosedForm], data: Measurements, fold: Fold, cut: InnerFolds | None
 ) -> dict[str, tuple[ClosedForm, float]]:
     """Solutions with their weights where positive, by rows which they were not conditioned on.
@@ -195,7 +195,7 @@ def _held(
     return LeftOutRows(np.concatenate(groups), mean, variance)
 
 
-def weigh(
+def weigh_process(
     field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
 ) -> tuple[tuple[GaussianProcess, float] | None, float | None]:
     """What a plain process on whole targets is worth next to a field, on rows that neither learned from.

@@ -24,7 +24,7 @@ from gsparc.data.splits import Fold, indices_hash
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import with_common_phase
 from gsparc.models.checkpoint import Stored
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import TimeBudget
@@ -51,11 +51,19 @@ _HASHED = (
 )
 
 
-def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-    """Fit a part, go on with it, or take it where `context.resume` is a folder in which it was finished.
+def fit(
+    factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext
+) -> tuple[Method, FitReport]:
+    """Make the method of these measurements and fit it, go on with it, or take what was finished.
+
+    Args:
+        factory: decides what the method is, once rows have a phase in common where that is possible.
+        data, fold: that it learns from.
+        context: its `resume` may be a folder in which the part was finished.
 
     Raises:
-        ValueError: the folder holds a part of other data, rows, seed or settings.
+        ValueError: the folder holds a part of other data, rows, seed or settings, or there are weights to
+            start from (`init_from`), and the method has none.
     """
     budget = TimeBudget()
     (data, rows), left = with_common_phase(data, fold), context.resume
@@ -64,15 +72,19 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         heeded.count("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
-            return _restore(method, data, fold, context, left / checkpoint.MODEL)
-        if not method.has_parts:
+            return _restored(factory, data, fold, context, left / checkpoint.MODEL)
+        if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
+    method = factory.made_for(data)
+    if context.init_from is not None and not (method.has_parts or method.takes_weights):
+        instead = "Gaussian fields do; start without it"
+        raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
     report = method.fit(data, rows, context)
-    if not aligning:
-        return report
-    cost = Cost({"alignment": aligning}) + report.cost
-    return replace(report, seconds=report.seconds + aligning, cost=cost)
+    if aligning:
+        cost = Cost({"alignment": aligning}) + report.cost
+        report = replace(report, seconds=report.seconds + aligning, cost=cost)
+    return method, report
 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
@@ -90,13 +102,16 @@ def folder_of(path: Path, parts: str) -> Path:
     return next((one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside)
 
 
-def _restore(method: Method, data: Measurements, fold: Fold, context: FitContext, file: Path) -> FitReport:
+def _restored(
+    factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext, file: Path
+) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
     Origin.of(data, fold, context).refuse_other(stored)
+    method, extra = factory.made_as(stored.target), stored.extra
     method.restore(data.site, stored.state)
-    extra = stored.extra
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
-    return FitReport(float(extra["train_s"]), tuple(extra.get("notes", ())), extra.get("limited_by"), cost)
+    notes = tuple(extra.get("notes", ()))
+    return method, FitReport(float(extra["train_s"]), notes, extra.get("limited_by"), cost)
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:

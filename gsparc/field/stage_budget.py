@@ -9,7 +9,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.field.processes import agreed
+from gsparc.field.distributed import agreed
 from gsparc.training.time_budget import NOTHING, Spent, TimeBudget
 
 SPENT = "time/spent_s"  # metric of both clocks

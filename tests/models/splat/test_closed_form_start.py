@@ -10,7 +10,7 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
-from gsparc.models.splat.closed_form import learn_prior, learn_process, warm_start
+from gsparc.models.splat.closed_form_start import learn_prior, learn_process, warm_start
 from gsparc.ops import Pose
 
 KERNEL = EmissionSettings(EncodingSettings("kernel"), activation="linear", init_bias=0.0)

@@ -11,8 +11,9 @@ from posts import POSTS, distances, heard
 from scenes import fold_of
 
 from gsparc.data.splits import SplitSettings
-from gsparc.models import stations
+from gsparc.models import each_or_together
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
@@ -26,7 +27,7 @@ def of_one_law():
 
 
 def test_powers_of_one_law_are_learned_together():
-    how, why = stations.best(*of_one_law(), FitContext(budget_s=6))
+    how, why = each_or_together.decide(*of_one_law(), FitContext(budget_s=6))
     assert how == "together" and "dB together" in why and "folds)" in why
 
 
@@ -41,23 +42,23 @@ def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best
 
         return lambda **settings: Wrong()
 
-    monkeypatch.setattr(stations, "JointPowerField", wrong("joint_powers"))
-    monkeypatch.setattr(stations, "PowerField", wrong("powers"))
-    how, why = stations.best(*of_one_law(), FitContext(budget_s=60))
+    monkeypatch.setattr(each_or_together, "JointPowerField", wrong("joint_powers"))
+    monkeypatch.setattr(each_or_together, "PowerField", wrong("powers"))
+    how, why = each_or_together.decide(*of_one_law(), FitContext(budget_s=60))
     said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
     assert how == best and said in why and "3 folds" in why
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
-    monkeypatch.setattr(stations, "ONE_FACTOR", 50)
-    how, why = stations.best(*of_one_law(), FitContext())
+    monkeypatch.setattr(each_or_together, "ONE_FACTOR", 50)
+    how, why = each_or_together.decide(*of_one_law(), FitContext())
     assert how == "each" and why.endswith("rows are more than one factor holds (50)")
 
 
 def test_stations_that_nobody_heard_are_answered_by_what_all_share():
     data, split = of_one_law()[0], SplitSettings("stations", leave_out=1)
     fold = fold_of(data, name="stations", leave_out=1)
-    assert stations.best(data, fold, FitContext(split=split))[0] == "together"
+    assert each_or_together.decide(data, fold, FitContext(split=split))[0] == "together"
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):
@@ -67,15 +68,15 @@ def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkey
     data = heard(30, csi=channels, frequency_hz=np.array(9.2e8))
     fold = fold_of(data)
     fits = []
-    monkeypatch.setattr(Gsparc, "fit", lambda self, *given: fits.append(given) or 1 / 0)
+    monkeypatch.setattr(Mixture, "fit", lambda self, *given: fits.append(given) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        PerStation(Gsparc).fit(data, fold, FitContext(tmp_path))
+        PerStation(Gsparc()).fit(data, fold, FitContext(tmp_path))
     assert len(fits) == 1 and len(fits[0][0]) == len(data)
     assert "stations=auto -> together: channels" in caplog.text
-    plain = PerStation(method_class("nearest"))
+    plain = PerStation(method_class("nearest")())
     plain.fit(data, fold, FitContext(tmp_path))
     assert len(dict(plain)) == len(POSTS) and caplog.text.count("stations=auto") == 1
-    each = PerStation(Gsparc)
+    each = PerStation(Gsparc())
     with pytest.raises(ZeroDivisionError):
         each.fit(data, fold, replace(FitContext(tmp_path), stations="each"))
     assert len(fits) == 2 and fits[1][2].budget_s is None

@@ -9,7 +9,7 @@ from clocks import wound
 from contexts import loaded, short
 
 from gsparc.commands.train import train
-from gsparc.field.pace import Budget
+from gsparc.field.stage_budget import Budget
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
@@ -58,7 +58,7 @@ def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
     monkeypatch.setattr(splatting, "prepare", slow)
     file = spectra(tmp_path / "own.npz")
     data, fold = loaded(file)
-    method = build(compose(*brief(file)).model)
+    method = build(compose(*brief(file)).model).made_for(data)
     callbacks = context.pop("callbacks", lambda: [Ticking()])
     report = method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))
     checkpoint.save(tmp_path / "model.ckpt", method)

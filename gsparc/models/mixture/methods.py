@@ -1,0 +1,79 @@
+"""What is solved in closed form for which kind of site, each under its name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gsparc.data.schema import Measurements
+from gsparc.models.mixture.candidates import CANDIDATES, Candidate
+from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.terms import no_array, no_phase
+
+PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
+
+
+def _named(*names: str) -> dict[str, Candidate]:
+    return {name: CANDIDATES[name] for name in names}
+
+
+class ImageSources(Mixture):
+    """Image sources, found by searches or along measured directions, beside a process of waves."""
+
+    name = "image_sources"
+
+    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+        """See `Mixture`."""
+        searched = ("sources", "rays") if data.directions is not None else ("sources",)
+        placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
+        # Offsets are known to sources alone.
+        return _named(*placed, *["diffuse"] * (self.plain and self.init.snapshot == "none"))
+
+    def obstacle(self, data: Measurements) -> str | None:
+        """See `Mixture`."""
+        return no_phase(data)
+
+
+class Channels(Mixture):
+    """Leakage, a direct wave and waves from all around; where rows were turned to each other, a process."""
+
+    name = "channels"
+
+    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+        """See `Mixture`; no phase tells of paths where rows have phases of their own."""
+        return _named("aligned" if data.site.phase_reference == "neighbours" else "diffuse")
+
+    def obstacle(self, data: Measurements) -> str | None:
+        """See `Mixture`."""
+        return None if data.site.kind == "csi" else f"the target is {data.site.kind}, not channels"
+
+
+class Powers(Mixture):
+    """A process of decibels about a distance law; of several stations, about a law of the site."""
+
+    name = "powers"
+    uses_censored = True
+
+    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+        """See `Mixture`; `init=scene` is the process of one station that knows walls."""
+        if self.init.name == "scene":
+            return {"scene": CANDIDATES["powers"]}
+        several = data.site.stations is not None and len(data.site.stations) > 1
+        return _named("joint_powers" if several else "powers")
+
+    def obstacle(self, data: Measurements) -> str | None:
+        """See `Mixture`."""
+        return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
+
+
+class Bearings(Mixture):
+    """Sources where bearings of a moving array cross, with processes of powers, beside the plain process."""
+
+    name = "bearings"
+
+    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+        """See `Mixture`."""
+        return _named("bearings", *["process"] * (self.plain and len(data) <= PROCESS_ROWS))
+
+    def obstacle(self, data: Measurements) -> str | None:
+        """See `Mixture`."""
+        return no_array(data.site, "tx", "the receiver stands still")
