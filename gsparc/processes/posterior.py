@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.kernel import apart
 from gsparc.processes.left_out import left_out
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
@@ -86,7 +86,7 @@ class Exact(Posterior):
     @cached_property
     def _near(self) -> Nearest | None:
         """What states the variance of many rows: exactly it costs their number squared for each place."""
-        if len(self.rows) <= MANY or not isinstance(self.prior.kernel, Kernel):
+        if len(self.rows) <= MANY or not self.prior.kernel.by_distance:
             return None
         terms = self.factor.whitened(self._columns)
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
@@ -139,12 +139,18 @@ class Exact(Posterior):
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""
-        return {**self.prior.state(), "places": self.rows, "weights": self.weights, "extra": self.extra}
+        arrays = {"rows": self.rows, "weights": self.weights, "extra": self.extra}
+        return {"prior": self.prior.state(), **arrays}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Exact:
         """Return the posterior whose `state()` this was."""
-        return cls(Prior.read(state), state["places"], state["weights"], state["extra"])
+        return cls(**{**state, "prior": Prior.read(state["prior"])})
+
+
+def posterior_of(state: dict[str, Any]) -> Exact | Nearest:
+    """Return the posterior whose `state()` this was."""
+    return Nearest.read(state) if "level" in state else Exact.read(state)
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:

@@ -8,7 +8,7 @@ TR 36.814, table A.2.1.1-2:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
@@ -40,7 +40,7 @@ class Sectors(Trend):
         band: see `rank`.
         shared: (6,) see `SHARED`.
         levels: (bands,) at the middle distance [dB].
-        doubt: (6 + bands, Q) what is uncertain of `columns`, for unit normal weights of a site.
+        doubt: (6 + bands, Q) what is uncertain of `shared_columns`, for unit normal weights of a site.
         gain: deviation of a sector's level [dB].
         unit: deviation of the processes [dB], in which terms are.
     """
@@ -58,7 +58,9 @@ class Sectors(Trend):
         """See `Trend`."""
         return self.at(places, self.shared, self.levels)
 
-    def at(self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None) -> Tensor:
+    def at(  # type: ignore[override]
+        self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
+    ) -> Tensor:
         """Return powers (..., n) [dB] for shared parameters (..., 6), levels; turn, tilt, width (..., 3)."""
         assert self.law is not None
         number = places[:, 6].long()
@@ -85,7 +87,7 @@ class Sectors(Trend):
         loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
-    def columns(self, places: Tensor) -> Tensor:
+    def shared_columns(self, places: Tensor) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         steps = STEP * torch.tensor(SHARED_SPREAD, dtype=torch.float64).diag()
         ends = self.at(places, self.shared + torch.cat([steps, -steps]), self.levels)
@@ -94,7 +96,7 @@ class Sectors(Trend):
         bands = torch.nn.functional.one_hot(self.band[places[:, 6].long()], len(self.levels)).to(places)
         return torch.cat([result.T, self.gain * bands], 1)
 
-    def terms(self, places: Tensor) -> Tensor:
+    def columns(self, places: Tensor) -> Tensor:
         """See `Trend`: each sector's level, azimuth, tilt, width and slope; what all share."""
         assert self.law is not None
         number = places[:, 6].long()
@@ -105,13 +107,8 @@ class Sectors(Trend):
         own = torch.stack(parts, 1) / self.unit
         which = torch.nn.functional.one_hot(self.rank[number], int(self.rank.max()) + 1).to(places)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        shared = self.columns(places) @ self.doubt / self.unit
+        shared = self.shared_columns(places) @ self.doubt / self.unit
         return torch.cat([(which[:, :, None] * own[:, None]).flatten(1), shared], 1)
-
-    def state(self) -> dict[str, Any]:
-        """See `Trend`."""
-        names = ("table", "rank", "band", "shared", "levels", "doubt", "gain", "unit")
-        return {**super().state(), "sectors": {name: getattr(self, name) for name in names}}
 
 
 @dataclass(frozen=True)
@@ -166,8 +163,3 @@ class Pairs:
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
         return cls(apart(a[..., :3], b[..., :3]), (a[..., 6:] == b[..., 6:].mT).to(a), alike)
-
-
-def with_sectors(trend: Trend, state: Mapping[str, Any]) -> Sectors:
-    """Return the trend whose `state()` had these sectors."""
-    return replace(Sectors(**{name: getattr(trend, name) for name in vars(trend)}), **state)

@@ -25,7 +25,7 @@ from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
 from tests.models.powers.test_settings import error_db, fit, town
 
-KERNEL = Kernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
+KERNEL = Kernel.matern((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 
 def rows_of(data, count: int) -> Rows:
@@ -215,7 +215,7 @@ def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
 def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
     rng = np.random.default_rng(0)
     places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
-    prior = Prior(SmoothRough.of_one(0.5, 0.1))
+    prior = Prior(Kernel.of_one(0.5, 0.1, term=SmoothRough))
     queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
     near = given_places(prior, Values.of(places, values), 0, most=40).answer(queries)
     exact = Exact.of(prior, torch.from_numpy(places), values).answer(queries)

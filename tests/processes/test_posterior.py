@@ -8,7 +8,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
@@ -22,7 +22,7 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     lengths, noise, level = rng.uniform(0.1, 3, 2), 10 ** rng.uniform(-3, 0), rng.normal()
     places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
     values = rng.normal(size=(count, outputs))
-    kernel = Kernel(tuple(lengths), (share, 1 - share), noise)
+    kernel = Kernel.matern(tuple(lengths), (share, 1 - share), noise)
     posterior = Exact.of(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
     found = posterior.answer(torch.from_numpy(queries))
     shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5)
@@ -41,7 +41,7 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     generator = torch.Generator().manual_seed(seed)
     places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
-    prior = Prior(WaveKernel(20.0, 0.7, 0.05))
+    prior = Prior(Kernel((IsotropicWaves(0.7, 1.0, 20.0),), 0.05))
     both = Exact.of(prior, places, values)
     pairs = Exact.of(prior, places, torch.cat([values.real, values.imag], 1))
     queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
@@ -75,7 +75,7 @@ def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
     """Within 2 % at places among the rows and far from all; means are the exact ones."""
     rng = np.random.default_rng(0)
     places = torch.from_numpy(np.c_[rng.uniform(0, 10, (1_500, 2)), np.zeros(1_500)])
-    kernel = Kernel((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
+    kernel = Kernel.matern((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
     values = -60 + 3 * torch.sin(places[:, :1]) + torch.from_numpy(rng.normal(size=(1_500, 1)))
     many = Exact.of(Prior(kernel, trend), places, values)
     inside = torch.from_numpy(np.c_[rng.uniform(0, 10, (200, 2)), np.zeros(200)])

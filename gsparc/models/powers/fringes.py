@@ -20,11 +20,10 @@ from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
-from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out, left_out_group
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
-from gsparc.processes.trend import Trend
+from gsparc.processes.prior import Prior
 from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5
@@ -162,7 +161,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: tuple[Trend, Kernel],
+    plain: Prior,
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -172,7 +171,7 @@ def find_fringes(
     Args:
         rows: all heard.
         numbers: (n,) of the rows, sorted.
-        plain: the process's mean law and kernel.
+        plain: of the process.
         wavelength: [m].
         seed: of starts, folds and rows that are drawn.
         budget: how many are sought, and when none is any longer.
@@ -191,7 +190,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process = conditioned(rows, *plain, seed)[0].exact()
+    process = conditioned(rows, plain, seed)[0].exact()
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None

@@ -21,7 +21,7 @@ from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.censored import Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart, bounds_of
+from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, settings_of
 from gsparc.processes.posterior import Exact
@@ -64,17 +64,9 @@ def fit_powers(
         seed: of the rows that are drawn where there are too many.
         chosen_on: rows that settings are chosen on, of more.
     """
-    trend, kernel, notes = choose_prior(rows, site, mean, seed, chosen_on)
-    process, more = conditioned(rows, trend, kernel, seed)
-    return process, (*notes, *more)
-
-
-def choose_prior(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
-) -> tuple[Trend, Kernel, tuple[str, ...]]:
-    """The settings of `fit_powers` alone, and what must be said of them."""
     best = chosen_among(rows, _trends(rows, site, mean), seed, chosen_on)
-    return best.trend, best.kernel, (best.description, *best.notes)
+    process, more = conditioned(rows, best.prior, seed)
+    return process, (best.description, *best.notes, *more)
 
 
 @dataclass(frozen=True)
@@ -86,6 +78,11 @@ class Candidate:
     kernel: Kernel
     cost: float
     notes: tuple[str, ...] = ()
+
+    @property
+    def prior(self) -> Prior:
+        """Both."""
+        return Prior(self.kernel, self.trend)
 
     @property
     def description(self) -> str:
@@ -110,15 +107,15 @@ def candidates(rows: Rows, site: Site, seed: int, chosen_on: int) -> list[Candid
 
 def mixture(
     rows: Rows, found: list[Candidate], seed: int, chosen_on: int
-) -> tuple[list[tuple[float, Prior]], tuple[str, ...]]:
+) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Candidates with their shares in a mean, the largest first, and what must be said of them.
 
     Shares have the least squared error at squares of floor left out, with a prior on equal ones.
     """
     if len(found) == 1:
-        return [(1.0, Prior(found[0].kernel, found[0].trend))], (found[0].description, *found[0].notes)
+        return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
     part = rows.drawn(chosen_on, seed)
-    posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in found]
+    posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
     gram, count = np.zeros((len(found),) * 2), 0.0
     for sides in SIDES:
         errors = np.stack([_left_out(one, sides) for one in posteriors])
@@ -129,7 +126,7 @@ def mixture(
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
     notes = dict.fromkeys(note for _, one in kept for note in one.notes)
-    return [(weight, Prior(one.kernel, one.trend)) for weight, one in kept], (*said, *notes)
+    return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
@@ -149,7 +146,7 @@ def chosen_among(
     if not many:
         return best
     values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
-    kernel, how = settings_of(Prior(best.kernel, best.trend), values, seed)
+    kernel, how = settings_of(best.prior, values, seed)
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
@@ -199,14 +196,13 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (n, n) [m], terms (n, P) and values less the mean (n, 1) [dB]."""
     places = torch.from_numpy(rows.places)
     values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.terms(places), values[:, None]
+    return apart(places, places), trend.columns(places), values[:, None]
 
 
 def _by_left_out(
     starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
 ) -> tuple[float, Kernel]:
-    bounds = bounds_of(len(starts[0].lengths), distance.numpy())
-    return by_left_out(starts, distance, terms, values, bounds, LOOKS, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), LOOKS, SETTLED)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
@@ -229,8 +225,8 @@ def _searched(rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.
 def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
     scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [Kernel((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
-    return near + [Kernel((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+    near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
+    return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
 def _weighed(rows: Rows, one: Candidate) -> Candidate:
@@ -238,16 +234,16 @@ def _weighed(rows: Rows, one: Candidate) -> Candidate:
     distance, terms, values = _views(rows, one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
-    bounds = bounds_of(len(one.kernel.lengths), distance.numpy())
+    bounds = one.kernel.bounds(distance)
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
     last: list[Sites] = []
 
     def objective(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * gram_of(at[:-1], distance, terms)
+        gram = at[-1].exp() * gram_of(one.kernel.at(at[:-1]), distance, terms)
         return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
-    start = np.append(one.kernel.parameters(), math.log(one.kernel.amplitude))
+    start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
     best, value = walked(objective, [start], bounds, EVIDENCE_LOOKS, EVIDENCE_SETTLED)
-    kernel = Kernel.of(best[:-1], math.exp(best[-1]))
+    kernel = replace(one.kernel.at(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)

@@ -222,7 +222,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
-    own = [rough.terms(at) * rough.unit for at in places]
+    own = [rough.columns(at) * rough.unit for at in places]
     bands, count = len(rough.levels), sum(len(part.index) for part in parts)
     last: list[list[Sites]] = [[] for _ in parts]
     kinds = own[0].shape[1] // (int(rough.rank.max()) + 1)
@@ -265,7 +265,7 @@ def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, se
         gram, quiet = covariance(i, at), side[i] != 0
         if quiet.any():
             gram.diagonal()[quiet] += last[i][0].variance
-        columns = Factor.of(gram, "raise").whitened(learned.columns(at_))
+        columns = Factor.of(gram, "raise").whitened(learned.shared_columns(at_))
         precision += columns.T @ columns
     doubt = Factor.of(precision, "raise").root.T
     amplitude = float(variances.exp().sum())
