@@ -26,7 +26,8 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
     distance, columns, values = rows(40, outputs)
 
     def density(at: torch.Tensor) -> torch.Tensor:
-        return LeftOutDensity.apply(gram_of(kernel.at(at), distance, columns), values, outputs + 1, bounded)[0]
+        gram = gram_of(kernel.at(at), distance, columns)
+        return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
 
     at = kernel.parameters().requires_grad_()
     (slope,) = torch.autograd.grad(density(at), at)

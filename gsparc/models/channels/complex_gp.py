@@ -222,9 +222,7 @@ def _aligned(
     return 0.5 * nll - float(aligning.abs().log().mean()), conditioned, aligning
 
 
-def _density(
-    kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor
-) -> float:
+def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
     """Negative log density of rows given their neighbours at the best power, visits to one place included.
 
     Args:
