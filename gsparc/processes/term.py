@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 from typing import Any, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
 
+PLUGINS = "gsparc.terms"  # entry points of installed terms
 _KINDS: dict[str, type[Term[Any]]] = {}  # by the name that `stored` gives them
 Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
 
@@ -81,6 +83,10 @@ def restored(state: Mapping[str, Any]) -> Any:
         ValueError: nothing that was imported defines a term of this name.
     """
     name = str(state["term"])
+    if name not in _KINDS:
+        for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
+            if point.attr == name:
+                point.load()
     if name not in _KINDS:
         raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
     return _KINDS[name].read(state["state"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import logging
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,6 +28,7 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.pareto import Settings
+from gsparc.models.powers.own_terms import columns_of
 from gsparc.models.reduced import contributions, knobs, reduced
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
@@ -265,9 +267,24 @@ class Channels(NamedMixture):
 
 
 class Powers(NamedMixture):
-    """A process of decibels about a distance law; of several stations, about a law of the site."""
+    """A process of decibels about a distance law; of several stations, about a law of the site.
+
+    Args:
+        *settings: of `NamedMixture`.
+        terms: further terms of one station's powers, see `columns_of`.
+        **named: see `settings`.
+    """
 
     name = "powers"
+    stored_names: ClassVar[dict[str, str]] = {**NamedMixture.stored_names, "terms": ""}
+
+    def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named: Any) -> None:
+        super().__init__(*settings, **named)
+        self.own_terms = tuple(columns_of(one) for one in terms)
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """See `NamedMixture`, with terms of the user's own."""
+        return super().fit(data, fold, replace(context, terms=self.own_terms))
 
     def tries(self, data: Measurements) -> tuple[str, ...]:
         """See `NamedMixture`; `init=scene` knows walls."""
@@ -276,6 +293,8 @@ class Powers(NamedMixture):
 
     def obstacle(self, data: Measurements) -> str | None:
         """See `NamedMixture`."""
+        if self.own_terms and data.site.stations is not None and len(data.site.stations) > 1:
+            return "model.terms are of one station's model; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 
 

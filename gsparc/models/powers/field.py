@@ -25,6 +25,7 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
+from gsparc.models.powers.own_terms import InWorld
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.processes.nearest import Nearest
@@ -32,6 +33,7 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximated
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
+from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -46,14 +48,18 @@ class PowerField(ClosedForm, kind="powers"):
         waves: whether coherent ones are sought where neighbours are closer than half a wavelength.
         seed: of rows and waves that are drawn.
         walls: that are known, in the coordinates of the measurements; no waves are sought beside them.
+        terms: further columns of the mean, in the coordinates of the measurements.
     """
 
     name = "process of powers"
     site: Site
     priors: tuple[tuple[float, Prior], ...]  # with shares of the mean, the largest first
 
-    def __init__(self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None) -> None:
-        self.waves, self.seed, self.walls = waves, seed, walls
+    def __init__(
+        self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None,
+        terms: tuple[Columns, ...] = (),
+    ) -> None:  # fmt: skip
+        self.waves, self.seed, self.walls, self.own_terms = waves, seed, walls, terms
         self.fringes: Fringes | None = None  # of coherent waves, beside the process
         self.powers: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
@@ -85,15 +91,16 @@ class PowerField(ClosedForm, kind="powers"):
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
+        more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
         if self.walls is not None:
             walls = counted(self.walls, site.origin, site.static_position)
             law, notes = law_of(seen, site)
-            trend = replace(trend_of_rows(seen, law), more=(walls,))
+            trend = replace(trend_of_rows(seen, law), more=(walls, *more))
             best = chosen_among(seen, [(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
             return (note, *notes, *best.notes)
-        found, said = candidates(seen, site, self.seed, chosen_on), list[str]()
+        found, said = candidates(seen, site, self.seed, chosen_on, more), list[str]()
         self.priors = ((1.0, found[0].prior),)
         if self.waves and not seen.silent.any() and sampled(seen.places, site.wavelength):
             order = np.argsort(rows)

@@ -27,6 +27,7 @@ from gsparc.processes.nearest import Values, settings_of
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
 from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import late
 from gsparc.training.time_budget import Effort
@@ -96,9 +97,14 @@ class Candidate:
         return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
 
 
-def candidates(rows: Rows, site: Site, seed: int, chosen_on: int) -> list[Candidate]:
-    """Of each mean law the settings of `choose_prior`, the best first; of few or very many rows the best."""
-    trends = _trends(rows, site, "auto")
+def candidates(
+    rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
+) -> list[Candidate]:
+    """Of each mean law the likeliest settings, the best first; of few or very many rows the best law alone.
+
+    Each law has further `terms`.
+    """
+    trends = [(replace(law, more=terms), *rest) for law, *rest in _trends(rows, site, "auto")]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
     found = [chosen_among(rows, [one], seed, chosen_on) for one in trends]
