@@ -68,5 +68,6 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
     (3, "3 is not a gsparc.processes.term.Columns"),
 ])  # fmt: skip
 def test_what_is_no_term_is_refused(trees, entry, why):
+    data = town()
     with pytest.raises(ValueError, match=why):
-        gsparc.fit(rx=town()["rx"], tx=STILL, rssi=town()["rssi"], model="powers", settings={"terms": [entry]})
+        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings={"terms": [entry]})
