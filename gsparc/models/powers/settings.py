@@ -46,7 +46,7 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
-LOOKS, SETTLED = 40, 5e-6
+LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
@@ -170,11 +170,12 @@ def _settings(
     if both and not late():
         candidates = [_weighed(weighed, one) for one in candidates]
     best = max(candidates, key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not both and not late():
-        best = _searched(loud, best, [best.kernel])
     if len(loud.places) >= TWO_LENGTHS_NEED and not late():
-        two = _searched(loud, best, _pairs(loud, best.kernel), 2.0)
+        two = _searched(few, best, _pairs(few, best.kernel), 2.0)
         best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
+    if len(loud.places) > len(few.places) and not both and not late():
+        # A look at all rows costs several at few: what was found on these is near already.
+        best = _searched(loud, best, [best.kernel], looks=REFINED)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
         note = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
@@ -206,9 +207,9 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
+    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
 ) -> tuple[float, Kernel]:
-    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), LOOKS, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
@@ -222,9 +223,11 @@ def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _searched(rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0) -> Candidate:
+def _searched(
+    rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
+) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = _by_left_out(starts, *_views(rows, one.trend))
+    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
