@@ -1,5 +1,7 @@
 """Posteriors against an independent library, and complex ones against twice as many real numbers."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import IsotropicWaves, Kernel
+from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
@@ -34,6 +36,42 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     np.testing.assert_allclose(found.left, covariance.diagonal() + noise, atol=1e-8)
     np.testing.assert_allclose(posterior.covariance(torch.from_numpy(queries)), covariance, atol=1e-8)
     np.testing.assert_allclose(posterior.values(), values, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sums_of_terms_are_gpytorchs(seed):
+    """Mean, variance and density of short and exponential shadowing with an uncertain level, all weighed."""
+    gpytorch = pytest.importorskip("gpytorch", reason="GPyTorch is not installed, of the extra `dev`")
+    draw = torch.Generator().manual_seed(seed)
+    share, short, long, noise, amplitude = (0.05 + 0.9 * torch.rand(5, generator=draw)).tolist()
+    places, queries = (3 * torch.rand(n, 2, generator=draw, dtype=torch.float64) for n in (30, 6))
+    values = torch.randn(30, generator=draw, dtype=torch.float64)
+    terms = Shadowing(short, share), ExponentialShadowing(long, 1 - share)
+    ours = Exact.of(Prior(Kernel(terms, noise, amplitude), Trend(0.0)), places, values[:, None])
+
+    parts, kernels = [], gpytorch.kernels
+    for kernel, weight in (
+        (kernels.MaternKernel(1.5), share),
+        (kernels.MaternKernel(0.5), 1 - share),
+        (kernels.ConstantKernel(), 1.0),
+    ):
+        parts.append(kernels.ScaleKernel(kernel).double())
+        parts[-1].outputscale = amplitude * weight
+    parts[0].base_kernel.lengthscale, parts[1].base_kernel.lengthscale = short, long
+    parts[2].base_kernel.constant = torch.ones(1, dtype=torch.float64)
+    likelihood = gpytorch.likelihoods.GaussianLikelihood().double()
+    likelihood.noise = amplitude * noise
+    theirs = gpytorch.models.ExactGP(places, values, likelihood)
+    normal = gpytorch.distributions.MultivariateNormal
+    theirs.forward = lambda at: normal(at.new_zeros(len(at)), (parts[0] + parts[1] + parts[2])(at))
+    off = gpytorch.settings.fast_computations(False, False, False)
+    with torch.no_grad(), off:
+        nats = likelihood(theirs.train()(places)).log_prob(values)
+        said, found = likelihood(theirs.eval()(queries)), ours.answer(queries)
+    told = Conditioned(ours.factor, values[:, None] / amplitude**0.5, ours.weights / amplitude**0.5)
+    torch.testing.assert_close(found.mean[:, 0], said.mean)
+    torch.testing.assert_close(amplitude * found.left, said.variance)
+    assert -told.nll - 15 * math.log(2 * math.pi * amplitude) == pytest.approx(float(nats))
 
 
 @pytest.mark.parametrize("seed", range(5))
