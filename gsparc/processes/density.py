@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -154,7 +155,9 @@ def walked(
     """
     low, high = np.array(bounds).T
 
-    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
+    @lru_cache(1 + len(starts))  # the walk begins by asking for the best start again
+    def asked(values: bytes) -> tuple[float, np.ndarray]:
+        point = np.frombuffer(values)
         at = torch.from_numpy(point.copy()).requires_grad_()
         try:
             value = objective(at)
@@ -162,6 +165,9 @@ def walked(
             return BAD, np.zeros(len(point))
         (slope,) = torch.autograd.grad(value, at)
         return float(value.detach()), slope.numpy()
+
+    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
+        return asked(point.tobytes())
 
     points = [np.clip(start, low, high) for start in starts]
     start = min(points, key=lambda point: ask(point)[0]) if len(points) > 1 else points[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,11 +18,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.censored import Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, settings_of
 from gsparc.processes.posterior import Exact
@@ -48,6 +50,7 @@ WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the 
 SIDES = (10, 5)  # squares along the longer side that are left out
 LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
+LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
@@ -94,21 +97,30 @@ class Candidate:
         law, noise = self.trend.law, f"noise {self.kernel.noise:.3g} of the signal's variance"
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
         word = "length" if len(parts) == 1 else "lengths"
+        word = f"exponential {word}" if isinstance(self.kernel.terms[0], ExponentialShadowing) else word
         return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
 
 
 def candidates(
     rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
 ) -> list[Candidate]:
-    """Of each mean law the likeliest settings, the best first; of few or very many rows the best law alone.
+    """Of each mean law the likeliest settings, the best first, then those of kriging.
 
-    Each law has further `terms`.
+    Of few or very many rows the best law alone. Each law has further `terms`.
     """
     trends = [(replace(law, more=terms), *rest) for law, *rest in _trends(rows, site, "auto")]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
-    found = [chosen_among(rows, [one], seed, chosen_on) for one in trends]
-    return sorted(found, key=lambda one: -one.score)
+    found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
+    return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
+
+
+def _kriged(rows: Rows, trend: Trend) -> Candidate:
+    """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
+    found = fit_variogram(rows.places, _views(rows, trend)[2].numpy())
+    sill = max(found.sill, LEAST_SILL * found.total)
+    kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
+    return Candidate(-math.inf, trend, kernel, 0.0)
 
 
 def mixture(
@@ -116,7 +128,7 @@ def mixture(
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Candidates with their shares in a mean, the largest first, and what must be said of them.
 
-    Shares have the least squared error at squares of floor left out, with a prior on equal ones.
+    Shares of two have the least squared error at squares of floor left out, with a prior on equal ones.
     """
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
@@ -127,12 +139,23 @@ def mixture(
         errors = np.stack([_left_out(one, sides) for one in posteriors])
         gram += errors @ errors.T / errors.shape[1] / len(SIDES)
         count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
-    share = best_weights(gram + gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found)))
+    gram += gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found))
+    share = _shares_of_two(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
     notes = dict.fromkeys(note for _, one in kept for note in one.notes)
     return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
+
+
+def _shares_of_two(gram: np.ndarray) -> np.ndarray:
+    """Shares (K,) of the best two, by products (K, K) of errors: each further one is as many more queries."""
+    tried = []
+    for pair in combinations(range(len(gram)), 2):
+        share = np.zeros(len(gram))
+        share[list(pair)] = best_weights(gram[np.ix_(pair, pair)])
+        tried.append(share)
+    return min(tried, key=lambda share: float(share @ gram @ share))
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
