@@ -21,6 +21,7 @@ from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.prior import Answer, Posterior, Prior
 
+BLOCK = 64  # rows of a covariance at a time
 MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
 
 
@@ -154,7 +155,11 @@ def posterior_of(state: dict[str, Any]) -> Exact | Nearest:
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
-    gram = prior.between(places, places)
+    gram = places.new_zeros(len(places), len(places))
+    for start in range(0, len(places), BLOCK):
+        part = slice(start, start + BLOCK)
+        # One triangle, all that a factor reads, in blocks that stay in the processor's caches.
+        gram[part, : start + BLOCK] = prior.between(places[part], places[: start + BLOCK])
     gram.diagonal().add_(prior.kernel.noise + extra)
     return Factor.of(gram, "raise")
 
