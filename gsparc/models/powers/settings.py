@@ -108,7 +108,8 @@ def candidates(
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """
-    trends = [(replace(law, more=terms), *rest) for law, *rest in _trends(rows, site, "auto")]
+    laws = _trends(rows, site, "auto")
+    trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
     found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
