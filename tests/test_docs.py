@@ -19,8 +19,13 @@ from gsparc.simulate.scenes.shipped import shipped
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
 SITE = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
-TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: f"{page.parent.name}/{page.name}")
+MEASURED = sorted((ROOT / "docs" / "results").glob("*.md"))  # their commands take long: read, not run
+PER_PAGE = pytest.mark.parametrize(
+    "page", [*PAGES, *MEASURED], ids=lambda page: f"{page.parent.name}/{page.name}"
+)
+TODAY = pytest.mark.parametrize(
+    "page", [*PRESENT, *MEASURED], ids=lambda page: f"{page.parent.name}/{page.name}"
+)
 README_LINES = 100
 GONE = ("vsgp", "directed", "model=bearings", "committee", "trainer.budget_s", "trainer.val_every")
 
@@ -52,6 +57,8 @@ def test_what_a_page_names_is_there(page):
     links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
     files, anchors = zip(*(link.partition("#")[::2] for link in links), strict=True) if links else ((), ())
     missing = [file for file in files if not (page.parent / file).exists()]
+    shown_tables = re.findall(r"<!-- table: (\S+) -->", text)
+    missing += [path for path in shown_tables if not (ROOT / path).exists()]
     rooms = r"(?:gsparc|ops|callbacks|conf|bench|tests|docs)"
     paths = re.findall(rf"`({rooms}/[\w./-]+(?:\.\w+|/))`", text)
     missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
@@ -111,7 +118,7 @@ def test_choices_and_names_are_of_today(page):
         assert not re.search(r"python train\.py (?!\.\.\.)", page.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", [*FOLDERS, "docs/results"])
 def test_the_site_has_every_page(folder):
     files = [f for kind in ("md", "ipynb") for f in (ROOT / folder).glob(f"*.{kind}")]
     assert not [f.name for f in files if str(f.relative_to(ROOT / "docs")) not in SITE]

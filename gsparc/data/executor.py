@@ -12,6 +12,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
@@ -101,8 +102,7 @@ def each(
     if not elsewhere() and threads == 1:
         results: Results = ((number, work(pieces[number])) for number in numbers)
     elif not elsewhere():
-        here = ((lambda number: (number, work(pieces[number])), number) for number in numbers)
-        results = _jobs(here, threads, "threading")
+        results = _in_threads(lambda number: (number, work(pieces[number])), numbers, threads)
     else:
         blob = cloudpickle.dumps((heeded.carried(work), os.getcwd(), torch.get_num_threads()))
         results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
@@ -137,9 +137,20 @@ def _piece(where: list[Any], number: int, piece: Any) -> tuple[int, Any]:
         return number, error
 
 
-def _jobs(calls: Iterable[Any], workers: int, backend: str) -> Results:
+def _in_threads(call: Callable[[int], tuple[int, Any]], numbers: Iterator[int], threads: int) -> Results:
+    # Its end waits for pieces that have begun: a thread inside compiled code aborts a process that exits.
+    with ThreadPoolExecutor(threads) as pool:
+        begun = {pool.submit(call, number) for number in islice(numbers, threads)}
+        while begun:
+            done, begun = wait(begun, return_when=FIRST_COMPLETED)
+            begun |= {pool.submit(call, number) for number in islice(numbers, len(done))}
+            for one in done:
+                yield one.result()
+
+
+def _jobs(calls: Iterable[Any], workers: int) -> Results:
     how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
-    jobs = joblib.Parallel(workers, backend, return_as="generator_unordered", **how)
+    jobs = joblib.Parallel(workers, "loky", return_as="generator_unordered", **how)
     warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
     yield from jobs(joblib.delayed(call)(*arguments) for call, *arguments in calls)
 
@@ -158,7 +169,7 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
         file.flush()
         while True:
             try:
-                for number, result in _jobs(calls(file.name), workers, "loky"):
+                for number, result in _jobs(calls(file.name), workers):
                     del begun[number]
                     yield number, result
                 return
@@ -166,7 +177,7 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                 lost.update(list(begun))
                 if max(lost.values(), default=TRIES) >= TRIES:
                     raise
-                log.warning("begun again: what a process did that died (%s)", reason(error).split(". ")[0])
+                log.warning("a process died, its work starts again (%s)", reason(error).split(". ")[0])
 
 
 def _ray() -> Any:

@@ -90,7 +90,7 @@ def predict(
     if far.any():
         log.warning(
             "%s: %d of %d places lie more than %.3g m outside the box of the training places%s, the first in "
-            "%s: expect little of the predictions there",
+            "%s: predictions there are unreliable",
             places, int(far.sum()), len(far), margin, in_height(world, site, far),
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip

@@ -139,10 +139,8 @@ def shown(value: float | None, form: str) -> str:
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Remarks on a table: rows that are not unseen, stand-ins, a busy machine, a baseline that is better."""
     seen = {
-        "train": ["these rows were learned from: eval_on=test is about others"],
-        "val": [
-            "val rows were chosen by or learned from, too, except by baselines: eval_on=test compares methods"
-        ],
+        "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
+        "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     cost = [f"cost: {facts['time/cost']}"] if facts.get("time/cost") else []
@@ -161,7 +159,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         conditions.append(
-            f"SIMULATED stand-in: the {release} release was not found; no figure here is about it"
+            f"SIMULATED stand-in: the {release} release was not found; these figures do not describe it"
         )
     if facts.get("split/unseen_runs"):
         count = facts["split/unseen_runs"]
@@ -170,7 +168,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
         repeat = "fixed steps or searches repeat exactly"
         if facts["model/limited_by_clock"] == "wall":
             repeat = f"budget_clock=processor does not count what others do, {repeat}"
-        conditions.append(f"seconds ended the training, so the result depends on this machine: {repeat}")
+        conditions.append(f"the time limit ended training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
         conditions.append(
@@ -189,8 +187,8 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     number = f"row {row}"  # as split.leave_out counts; the file may count otherwise
     called = number if name in (None, number) else f"{name} ({number} of split.leave_out)"
     return [
-        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they are about "
-        f"it. The median row's NMSE is {median:.3g}"
+        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they describe "
+        f"little else. The median row's NMSE is {median:.3g}"
     ]
 
 

@@ -28,7 +28,7 @@ from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning, words
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import weights_of
-from gsparc.processes.neighbourhood import covering
+from gsparc.processes.neighbourhood import covering, spacing
 from gsparc.processes.two_lengths import first_kernel, two_lengths
 
 log = logging.getLogger(__name__)
@@ -59,16 +59,17 @@ class Alignment:
     phase_reference: Literal["carrier", "neighbours"]
 
 
-def with_common_phase(data: Measurements, fold: Fold) -> Measurements:
-    """The measurements with training and validation rows turned to each other; as they are where that is so.
+def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
+    """Return measurements with training and validation rows turned to each other, and rows to learn from.
 
-    Rows keep what `site.freedom` leaves them; test rows are not looked at.
+    Several packets of one place and station become one, the first of them, whose channel is their mean. Rows
+    keep what `site.freedom` leaves them; test rows are not looked at. Without freedom nothing is done.
     """
     site = data.site
     if site.freedom == "none" or site.phase_reference is not None:
-        return data
+        return data, fold
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    key = (known.tobytes(), site.sha256)
+    key = (fold.train.tobytes(), fold.val.tobytes(), site.sha256.encode())
     for kept, its, result in _LAST:
         if kept() is data and its == key:
             return result
@@ -92,11 +93,31 @@ def with_common_phase(data: Measurements, fold: Fold) -> Measurements:
         len(known), words(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
-    result = replace(
+    train, val = (averaged(data, target, rows) for rows in (fold.train, fold.val))
+    turned = replace(
         data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
     )
+    result = turned, Fold(train, val, fold.test)
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
+
+
+def averaged(data: Measurements, target: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the first of `rows` at each place and station, whose `target` (S, A, K) becomes their mean."""
+    if not len(rows):
+        return rows
+    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    _, first, packet = np.unique(
+        np.c_[data.moving[rows], station], axis=0, return_index=True, return_inverse=True
+    )
+    measured = np.ones_like(target[rows], bool) if data.mask is None else data.mask[rows]
+    packet = packet.reshape(-1)
+    total = np.zeros((len(first), *target.shape[1:]), target.dtype)
+    count = np.zeros(total.shape)
+    np.add.at(total, packet, np.where(measured, target[rows], 0))
+    np.add.at(count, packet, measured)
+    target[rows[first]] = total / np.maximum(count, 1)
+    return np.sort(rows[first])
 
 
 def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
@@ -114,7 +135,8 @@ def _rms(values: np.ndarray) -> np.ndarray:
     return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
 
 
-_LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, str], Measurements]] = []  # baselines share it
+# Of the last alignment the measurements, what else it depends on, and its result: baselines share it.
+_LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measurements, Fold]]] = []
 
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
@@ -123,7 +145,7 @@ def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
         values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
-    length = site.wavelength or SPACINGS * _spacing(rows.places)
+    length = site.wavelength or SPACINGS * spacing(rows.places)
     one = _Rows(rows.places, values, rows.tones, freedom, length)
     found = [one.smooth(one.along_tree(None))]
     direct = _direct(rows, site)
@@ -166,7 +188,7 @@ class _Rows:
 
     def smooth(self, factors: np.ndarray) -> Alignment:
         """From these factors on, by a process of two lengths; of its rounds the one that tells rows best."""
-        kernel, found = first_kernel(self.length), []
+        kernel, found = first_kernel(self.length, spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
             found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "neighbours"))
@@ -211,11 +233,6 @@ class _Rows:
         told = told * turning(told, self.values, self.tones, self.freedom)[:, None]
         missed = np.abs(self.values - told) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
-
-
-def _spacing(places: np.ndarray) -> float:
-    near = cKDTree(places).query(places, k=min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
-    return max(float(np.median(near)), 1e-9)
 
 
 def _direct(rows: Snapshots, site: Site) -> np.ndarray | None:

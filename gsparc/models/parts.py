@@ -58,7 +58,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         ValueError: the folder holds a part of other data, rows, seed or settings.
     """
     budget = TimeBudget()
-    data, left = with_common_phase(data, fold), context.resume
+    (data, rows), left = with_common_phase(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count("*")
@@ -68,7 +68,7 @@ def fit(method: Method, data: Measurements, fold: Fold, context: FitContext) -> 
         if not method.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
-    report = method.fit(data, fold, context)
+    report = method.fit(data, rows, context)
     if not aligning:
         return report
     cost = Cost({"alignment": aligning}) + report.cost
@@ -168,7 +168,7 @@ class Origin:
             )
         changed = _differences(before, now, CHANGEABLE)
         if changed:
-            log.warning("going on from %s, which had %s", stored.path, some(changed))
+            log.warning("continuing from %s, which had %s", stored.path, some(changed))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:

@@ -266,7 +266,7 @@ def _with_pseudo_values(
     near = (doubt < CERTAIN).nonzero()[:, 0]
     most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
     if len(near) > most:
-        notes.append(f"{most} of {len(near)} rows near the level are used, those in doubt")
+        notes.append(f"{most} of {len(near)} rows near the level are used, the least certain ones")
         # Rows nearest to their level tell most; then back in the order of rows.
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
@@ -275,7 +275,7 @@ def _with_pseudo_values(
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:
-            notes.append("what these rows say had not settled after all sweeps")
+            notes.append("expectation propagation of these rows did not converge in all sweeps")
     used = torch.cat([(~silent).nonzero()[:, 0], at]).sort().values
     gram = gram[used[:, None], used]
     gram.diagonal().add_(extra[used])

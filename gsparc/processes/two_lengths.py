@@ -17,19 +17,23 @@ from gsparc.processes.neighbourhood import covering
 
 SHORT, LONG = (0.25, 1.0), (1.0, 300.0)  # wavelengths; next to no field varies within a quarter
 START = (0.37, 2.8)
+SPANS = 3.0  # spacings between places, that the longer length starts from at least
 NOISES = (1e-4, 10.0)  # of the signal's power
 LOGIT = 6.0  # of the shares
 LEARNED_ON = 400  # rows
 LOOKS, SETTLED = 8, 1e-4
 
 
-def first_kernel(length: float) -> Kernel:
-    """Return the kernel before anything was learned; `length` is a wavelength, or what stands for it [m].
+def first_kernel(length: float, spacing: float = 0.0) -> Kernel:
+    """Return the kernel before anything was learned.
+
+    `length` is a wavelength, or what stands for it; `spacing` between places, which the longer one spans [m].
 
     >>> [round(length, 3) for length in first_kernel(0.1).lengths]
     [0.037, 0.28]
     """
-    return Kernel.matern((START[0] * length, START[1] * length), (0.5, 0.5), 0.01)
+    lengths = START[0] * length, max(START[1] * length, SPANS * spacing)
+    return Kernel.matern(lengths, (0.5, 0.5), 0.01)
 
 
 def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:

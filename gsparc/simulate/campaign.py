@@ -137,7 +137,7 @@ def _trace_all(
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
-        log.info("%d of %d shards are there already", len(parts) - len(missing), len(parts))
+        log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))
     work = _Tracing(campaign, effects, shards, survey)
     spent = [row_s for _, row_s in each(work, missing, "shards", cost=lambda shard: len(shard[1]))]
     return float(np.nanmean(spent)) if np.isfinite(spent).any() else None

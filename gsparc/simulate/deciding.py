@@ -152,7 +152,7 @@ class Decider:
             log.info("auto: %s; verifying on held-back receivers", choice.effects)
             choice, changed = self._verify(traced, choice)
             if choice.verdict is not None and not choice.verdict.kept:
-                log.info("auto: held-back receivers refute it; everything is needed")
+                log.info("auto: verification on held-back receivers failed; everything is simulated")
                 choice = auto.everything(choice, self.full)
         if self.settings.rays < 1 and self.survey.engine.random:
             choice, changed = self._fewer_rays(traced, choice, changed)

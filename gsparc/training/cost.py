@@ -44,11 +44,11 @@ class Cost:
         """One line."""
         parts = []
         for name, spent in self.stages.items():
-            unused = f" ({self.unused[name]:.1f} without weight)" if name in self.unused else ""
+            unused = f" ({self.unused[name]:.1f} s unused)" if name in self.unused else ""
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
-        ended = "" if limited_by is None else "; seconds ended it"
+        ended = "" if limited_by is None else "; the time limit ended it"
         share = self.unused_s / max(self.seconds, LEAST_S)
-        return f"{', '.join(parts)}; {share:.0%} of {self.seconds:.1f} s without weight{ended}"
+        return f"{', '.join(parts)}; {share:.0%} of {self.seconds:.1f} s unused{ended}"
 
 
 NO_COST = Cost()

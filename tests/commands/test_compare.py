@@ -39,13 +39,13 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     only = "only=[own/random/mean/*,own/random/nearest/*,own/random/swiftwrf/*]"
     status, said = compare(tmp_path, only)
     assert status == 0, said
-    assert "3 cells, 0 of them are there" in said and len(FILLED.findall(said)) == 3
+    assert "3 cells, 0 already done" in said and len(FILLED.findall(said)) == 3
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["own/random/0.3/first"] in ("nearest", "mean", "swiftwrf")
     assert summary["own/random/0.3/swiftwrf/query_ms_p50"] > 0
     for file in ("compare.csv", "compare.md", "compare.png"):
         assert (tmp_path / "run" / file).exists()
-    assert "3 cells, 3 of them are there" in compare(tmp_path, only, "latency=false")[1]
+    assert "3 cells, 3 already done" in compare(tmp_path, only, "latency=false")[1]
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
     with locked(tmp_path / "cells"):
         status, said = compare(tmp_path, only, f"hydra.run.dir={tmp_path / 'other'}")
@@ -53,9 +53,9 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     assert "give another cells=" in said and not (tmp_path / "other" / "compare.md").exists()
     # A cell whose result is not whole does not count, nor does one of other data under the same name.
     (tmp_path / "cells/own/random/mean/any/any/summary.json").write_text("{")
-    assert "3 cells, 2 of them are there" in compare(tmp_path, only, "latency=false")[1]
+    assert "3 cells, 2 already done" in compare(tmp_path, only, "latency=false")[1]
     spectra(tmp_path / "own.npz", rows=44)
-    assert "3 cells, 0 of them are there" in compare(tmp_path, only, "latency=false", "train=false")[1]
+    assert "3 cells, 0 already done" in compare(tmp_path, only, "latency=false", "train=false")[1]
 
 
 PLAIN = "only=[own/random/nearest/*,own/random/gp/*]", "latency=false"

@@ -166,3 +166,20 @@ def test_an_interrupt_ends_the_work_within_seconds(tmp_path, engine):
         os.killpg(one.pid, signal.SIGINT)  # as a terminal does
         assert one.wait(60) == 130 and one.stdout.read() == "interrupted\n"
     assert time.perf_counter() - began < 15
+
+
+def test_threads_ended_in_compiled_code_at_an_interrupt():
+    """`gsparc map` aborted (exit status -6) at Ctrl-C: what had begun was left to the end of the process."""
+    ended = []
+
+    def work(piece):
+        time.sleep(0.05)
+        ended.append(piece)
+
+    with pytest.raises(KeyboardInterrupt):
+        for _ in each(work, range(8), threads=2):
+            raise KeyboardInterrupt
+    assert len(ended) <= 4  # those begun, and no others
+    before = list(ended)
+    time.sleep(0.1)
+    assert ended == before

@@ -1,8 +1,10 @@
-"""The table of docs/peers.md: settings of the peers beside the published ones.
+"""The table that docs/peers.md links: settings of the peers beside the published ones.
 
 Ours are defaults of their classes, the published ones in conf/paper; docstrings say what was left out.
 """
 
+import csv
+import io
 import re
 from importlib import import_module
 from pathlib import Path
@@ -14,17 +16,17 @@ from gsparc.data.instantiate import node_of
 from gsparc.models.registry import method_class
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "peers.md"
-BEGIN = "<!-- settings: written by `python tests/helpers/published_table.py` -->"
-END = "<!-- end of settings -->"
+FILE = ROOT / "docs" / "results" / "compare" / "settings.csv"
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
 NO_SETTING = ("_target_", "name", "seed", "budget_s")
 
 
 def table() -> str:
-    """A row for each peer; ValueError where conf/paper names what is no setting of the model."""
-    heads = ("`model=`", "as published", "ours (published)", "ours, no published value known", "left out")
-    rows = [heads, ("---",) * len(heads)]
+    """CSV, a row for each peer; ValueError where conf/paper names what is no setting of the model."""
+    heads = ("model", "as published", "ours (published)", "ours, no published value known", "left out")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(heads)
     for peer in PEERS:
         ours, paper = settings("model", peer), settings("paper", peer)
         if unknown := set(paper) - set(ours):
@@ -34,8 +36,8 @@ def table() -> str:
         alone = [f"{key} {value}" for key, value in ours.items() if key not in paper and value is not None]
         said = " ".join((import_module(method_class(peer).__module__).__doc__ or "").split())
         left_out = re.findall(r"Left out: (.*?)\.(?: |$)", said)
-        rows.append((f"`{peer}`", *map("; ".join, (same, other, alone, left_out))))
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows).replace("None", "null")
+        writer.writerow((peer, *map("; ".join, (same, other, alone, left_out))))
+    return text.getvalue().replace("None", "null")
 
 
 def settings(group: str, peer: str) -> dict[str, Any]:
@@ -46,11 +48,5 @@ def settings(group: str, peer: str) -> dict[str, Any]:
     return {key: value for key, value in chosen.items() if key not in NO_SETTING}
 
 
-def written(text: str) -> str:
-    """A page with the table of today between its markers."""
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n\n{table()}\n\n{END}{rest.split(END)[1]}"
-
-
 if __name__ == "__main__":
-    PAGE.write_text(written(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    FILE.write_text(table(), encoding="utf-8")

@@ -27,7 +27,7 @@ def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), befo
     console = open_console()
     for one in tables:
         console.print(one)
-    log = "".join(f"; the whole log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
+    log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
     for line in (*warned_again(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
 

@@ -63,7 +63,7 @@ def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
     """Five (topic, sentence) pairs about a dataset and how a run divides it."""
     train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
     folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
-    rows = f"{train} rows to learn from, {val} to validate, {test} to test{folds}"
+    rows = f"{train} training, {val} validation and {test} test rows{folds}"
     return [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),

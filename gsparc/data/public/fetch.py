@@ -19,7 +19,7 @@ from gsparc.data.files import platform_cache, shipped
 
 log = logging.getLogger(__name__)
 
-MIRROR = "GSPARC_DATA_URL"  # environment variable: a server or folder tree laid out as GitHub's raw files are
+MIRROR = "GSPARC_DATA_URL"  # environment variable: a server laid out as GitHub's raw files
 RAW = "https://raw.githubusercontent.com"
 STALLED_S = 30.0  # without a byte
 CHUNK = 2**16  # bytes

@@ -117,7 +117,7 @@ def once(
     """
     facts = None if again else finished(folder, state, reuse)
     if facts is not None:
-        log.info("%s: was done before", folder)
+        log.info("%s: already done", folder)
         return facts
     record = read_summary(folder / RECORD)
     left = None

@@ -134,7 +134,7 @@ def fill_all(
     there = [one.result() for one in prepared]
     found = {str(one.cell): one for one in there if one is not None}
     missing = [one for one in prepared if str(one.cell) not in found]
-    log.info("%d cells, %d of them are there", len(prepared), len(found))
+    log.info("%d cells, %d already done", len(prepared), len(found))
     started = time.monotonic()
 
     def fits(one: Prepared) -> bool:
@@ -148,7 +148,7 @@ def fill_all(
     try:
         for number, result in each(work, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
             if isinstance(result, str):
-                log.warning("%s cannot be filled: %s", here[number].cell, result)
+                log.warning("%s failed: %s", here[number].cell, result)
                 continue
             found[str(result.cell)] = result
             score = score_db(result.facts["dataset/kind"], result.facts)

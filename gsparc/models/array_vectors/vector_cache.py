@@ -42,7 +42,7 @@ def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Reco
     known = _kept(f"{identity(data)} {seed}")
     missing = rows[known["wall"][rows] < 0] if known else rows
     if len(missing) < len(rows):
-        log.info("array vectors of %d spectra are known from before", len(rows) - len(missing))
+        log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
         recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)

@@ -30,7 +30,7 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import Values, given, solved
-from gsparc.processes.neighbourhood import Neighbourhood, covering
+from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
 from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
 from gsparc.processes.prior import Prior
 from gsparc.processes.two_lengths import first_kernel, two_lengths
@@ -91,7 +91,8 @@ class ComplexGP(ClosedForm, kind="aligned"):
         """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""
         assert self.site is not None and self.site.wavelength is not None
         if self.site.phase_reference == "neighbours":
-            kernel, rows = first_kernel(self.site.wavelength), (places.numpy(), values.numpy())
+            at = places.numpy()
+            kernel, rows = first_kernel(self.site.wavelength, spacing(at)), (at, values.numpy())
             for _ in range(REFINED):
                 kernel = two_lengths(*rows, self.site.wavelength, kernel)
             yield replace(kernel, amplitude=1.0)

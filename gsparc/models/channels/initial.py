@@ -235,7 +235,7 @@ class _Search:
             with cancelled_by(budget.over):
                 self._grow(steps, notes)
         except Cancelled:
-            notes.append("waves: the seconds ended the search for terms")
+            notes.append("waves: the time limit ended the search for terms")
         return steps[-1], notes
 
     def _grow(self, steps: list[Candidate], notes: list[str]) -> None:

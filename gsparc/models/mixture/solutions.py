@@ -100,7 +100,9 @@ def find(
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = comparable(data.batch(field.held.rows).target, data.site)
-                one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
+                one = Race.of(
+                    field.held.rows, comparable(field.held.mean, data.site), target, note, context.effort
+                )
                 if race is None or part not in SEARCHES:
                     note(name, float(one.squared.mean()))
                 else:
@@ -126,7 +128,7 @@ def _reached(race: Race | None) -> str | None:
     """Why no search can gain much, where another solution is as near as searches come; else None."""
     if race is None or race.error > CONVERGED_ERROR:
         return None
-    return f"another solution misses {race.error:.4f} of the energy of rows held out"
+    return f"another solution has an NMSE of {race.error:.4f} on held-out rows"
 
 
 def weighed(
@@ -165,7 +167,7 @@ def weighed(
     weights = solution_weights.weights(predicted, target, unit)
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
-            "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
+            "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,
             solution_weights.error(one, target), weight,
         )  # fmt: skip
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
@@ -239,7 +241,7 @@ def weigh(
     if spectra:
         weight = solution_weights.share_of_second(rows)
     log.info(
-        "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
+        "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
         len(val), 0 if left is None else len(left.centres), weight,
     )  # fmt: skip
     return ((process, weight) if weight > 0 else None), explained

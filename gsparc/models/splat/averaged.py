@@ -152,7 +152,7 @@ class ImageProcess(LearnedField):
     def made(self) -> str:
         """See `Method`."""
         weight = 0.0 if self._average is None else self._average[1]
-        return super().made + (f"; a plain process weighs {weight:.2g}" if self.plain else "")
+        return super().made + (f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else "")
 
     def field_alone(self) -> Method | None:
         """See `Method.field_alone`."""

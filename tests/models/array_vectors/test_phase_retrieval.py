@@ -90,7 +90,7 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     assert asked == [10, 8, 7] and seconds.wall > 0 and later.wall > seconds.wall / 2
     assert seconds.processor > 0 and seconds.processor / 2 < later.processor
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
-    assert "array vectors of 5 spectra are known from before" in caplog.messages
+    assert "array vectors of 5 spectra were computed before" in caplog.messages
     other = replace(data, site=replace(data.site, sha256="another"))
     vector_cache.recovered(other, np.arange(3))
     vector_cache.recovered(other, np.arange(3), seed=1)
