@@ -29,6 +29,7 @@ MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many o
 class Exact(Posterior):
     """Given n rows with one factor.
 
+    >>> from gsparc.processes.kernel import Kernel
     >>> prior = Prior(Kernel.of_one(length=2.0, noise=0.01))
     >>> places = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)  # on a line [m]
     >>> posterior = Exact.of(prior, places, places.sin())

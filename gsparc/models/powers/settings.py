@@ -38,7 +38,7 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; with little effort
+COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
@@ -186,8 +186,7 @@ def _settings(
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows if rows.silent.all() else rows.loud
     loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on, seed))
-    compared_on = min(COMPARED_ON, max(chosen_on // 2, LEAST_COMPARED_ON))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
+    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
     weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
