@@ -1,7 +1,5 @@
 """Small invented campaigns, and the real subset where it is present."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

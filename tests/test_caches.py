@@ -1,7 +1,5 @@
 """What was kept is found again for the same data only: every fact of a site changes every key."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, fields, replace
 
 import numpy as np

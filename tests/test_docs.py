@@ -1,7 +1,5 @@
 """The map shows every package, and the documents name files, commands and choices that exist."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from functools import cache

@@ -1,7 +1,5 @@
 """Examples of docstrings answer what they say."""
 
-from __future__ import annotations
-
 import doctest
 import re
 from importlib import import_module

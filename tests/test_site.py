@@ -1,7 +1,5 @@
 """The documentation site: tutorials run, the build is strict, links lead somewhere, nothing is fetched."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -17,7 +17,7 @@ from gsparc.apps.export.compiled.make import FIGURES, compiled
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
-from gsparc.data.limits import POSITIVE, SettingError, choice, or_null, whole
+from gsparc.data.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import in_world, with_heights
@@ -33,8 +33,7 @@ Facts = tuple[dict[str, Any], list[str]]
 def task(config: DictConfig) -> dict[str, Any]:
     """Export, and say what is lost; returns the facts of `summary.json`."""
     RunSettings.of(config)
-    for name, limit in LIMITS.items():
-        limit.check(name, config[name])
+    check_arguments(config, **LIMITS)
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
     if out.exists():

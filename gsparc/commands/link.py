@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -9,7 +10,6 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
@@ -18,6 +18,8 @@ from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import shown, table, write_summary
+
+log = logging.getLogger(__name__)
 
 RATES = {
     "oracle_mbps": ("oracle Mbit/s", ".1f"), "chosen_mbps": ("chosen", ".1f"), "shortfall": ("short", ".1%"),
@@ -44,22 +46,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     levels = settings["mcs"]["snr_db"]
     points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
     errors, surest = {}, {}
-    columns = *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
-    with Progress(*columns) as bar:
-        adapting = bar.add_task("rate adaptation", total=len(levels), now="")
-        rates, own = study.rates(lambda: bar.advance(adapting))
-        facts |= own | {"time/mcs_s": time.perf_counter() - started}
-        draw_rates(rates["expected"], study.score, title, run_dir / "mcs.png")
-        write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
-        sending = bar.add_task("PUSCH", total=sum(map(len, points.values())), now="")
-        for modulation, ebno_db in points.items():
-
-            def tick(now: str, modulation: str = modulation) -> None:
-                bar.update(sending, advance=1, now=f"{modulation} {now}")
-
-            errors[modulation], surest[modulation], own = study.send(modulation, ebno_db, tick)
-            facts |= own
-            write_summary(run_dir / "summary.json", facts)
+    rates, own = study.rates()
+    facts |= own | {"time/mcs_s": time.perf_counter() - started}
+    draw_rates(rates["expected"], study.score, title, run_dir / "mcs.png")
+    write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
+    for modulation, ebno_db in points.items():
+        log.info("PUSCH, %s", modulation)
+        errors[modulation], surest[modulation], own = study.send(modulation, ebno_db)
+        facts |= own
+        write_summary(run_dir / "summary.json", facts)
     if errors:
         draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")

@@ -12,7 +12,7 @@ from gsparc.apps.locate.judging import by_fingerprints, by_model, report
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.data.limits import POSITIVE, SHARE, choice, number, or_null, switch, whole
+from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)), "track": switch(),
@@ -28,8 +28,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     """Locate as conf/locate.yaml says, into a folder; returns the facts of its `summary.json`."""
     RunSettings.of(config)
-    for name, limit in LIMITS.items():
-        limit.check(name, config[name])
+    check_arguments(config, **LIMITS)
     for name in config.against:
         choice(*BASELINES).check("against", name)
     if config.dataset.name == "fingerprints":

@@ -39,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
     promise, error = promise_of(path, settings), NewStation()
     if config.left_out:
-        error = new_station_error(*trained(path, settings["dataset"]), int(config.left_out))
+        error = new_station_error(trained(path, settings["dataset"]), int(config.left_out))
     placing = place_next(predictor, count=config.count, promise=promise, error=error, **query)
     columns = coordinates(placing.places, predictor)
     columns |= {placing.what: placing.goal, "low": placing.low, "high": placing.high}

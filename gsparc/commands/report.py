@@ -33,9 +33,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
     for run in runs:
         stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
-        own = {run.figure: run.figure_of(run.figure), "train_s": run.facts["time/train_s"]}
-        own |= dict(zip(("render_ms_p50", "render_ms_p95"), run.latency, strict=True))
-        facts |= {f"{stem}/{name}": value for name, value in own.items()}
+        own = {"train_s": "train_s", "render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms"}
+        own[run.row["figure"]] = "value"
+        facts |= {f"{stem}/{name}": run.row[column] for name, column in own.items()}
     write_summary(out / "summary.json", facts)
     console = open_console()
     if config.readme:

@@ -13,12 +13,15 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish, in_multirun, run_directory
+from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import plain
+from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
+from gsparc.evaluation.experiment.done import State, content, once
 from gsparc.evaluation.metric_formats import DECIDING, score_of
-from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
 from gsparc.models.pareto import front
@@ -32,9 +35,18 @@ log = logging.getLogger(__name__)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """What the command does; returns the facts of `summary.json`; a job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
+    state = State.of(config, content(run.data), run.split.sha256)
+    trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
+    state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
+    with locked(run_dir / ".job"):
+        return once(run_dir, state, lambda left: _swept(config, run, run_dir), again=not in_multirun())
+
+
+def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
+    """Measure, draw and write."""
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
     rows = rows_of(fold, config.eval_on)
     learned = np.sort(np.concatenate([fold.train, fold.val]))
@@ -61,7 +73,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         if value is not None
     }
     copy_ms = float(np.median(other_ms[COPY]))
-    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of(points, pareto, chosen, copy_ms))
+    table_of_points = tradeoff.table_of(points, pareto, chosen, copy_ms)
+    write_samples(run_dir / "tradeoff.csv", table_of_points.to_dict("list"))
     best = [points[i] for i in pareto]
     title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
     save(tradeoff.draw_front(points, pareto, beside, figure, method.name, title), run_dir / "tradeoff.png")
@@ -77,17 +90,15 @@ def task(config: DictConfig) -> dict[str, Any]:
         tracking.picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.table(loggers, "operating points", heads, lines)
     sentences = [*tradeoff.irreducible(method), *tradeoff.slope(facts)]
-    facts = finish(run_dir, facts, table(title, ["not beaten"], heads[1:], lines), lines=sentences)
+    finish(run_dir, facts, table(title, ["not beaten"], heads[1:], lines), lines=sentences)
     for p in best:
         other = tradeoff.beaten_by(p, beside, figure)
         if other is not None:
             log.warning("%s: %s is as fast and better", p.label, other)
-    return facts
 
 
 def _threads(setting: Sequence[int] | None) -> list[int]:
     counts = sorted({1, torch.get_num_threads()}) if setting is None else sorted({int(n) for n in setting})
-    cores = os.cpu_count() or 1
-    if counts and counts[0] >= 1 and counts[-1] <= cores:
-        return counts
-    raise ValueError(f"threads={counts}: numbers between 1 and the {cores} cores of this machine are needed")
+    for count in counts or [0]:  # at most the cores of this machine
+        whole(1, os.cpu_count()).check("threads", count)
+    return counts

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared import cli
-from gsparc.commands.shared.output import run_directory, show
+from gsparc.commands.shared.output import in_multirun, run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
@@ -34,7 +33,7 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import State, content, once, program
+from gsparc.evaluation.experiment.done import State, content, finished, once, program
 from gsparc.evaluation.experiment.fit import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
@@ -353,17 +352,20 @@ def task(config: DictConfig) -> float:
         The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned; NaN
             where the data do not tell it and no search asks.
     """
-    hydra = HydraConfig.get()
-    run_dir, job = run_directory(), hydra.mode == RunMode.MULTIRUN
+    hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
     if config.ckpt_path is not None:
         words = " ".join(hydra.overrides.task)
         log.info("with the settings of the run that it goes on from: %s", words)
     with locked(run_dir / ".job"):  # the run's own is its training's
-        begun = begin(config)
-        state = State.of(config, content(begun.module.measurements), begun.split.sha256)
-        facts = once(
-            run_dir, state, partial(_train_and_show, config, begun), reuse=config.reuse, again=not job
-        )
+        unread = State.unread(config) if job else None
+        facts = finished(run_dir, unread, config.reuse) if unread else None
+        if facts is not None:
+            log.info("%s: was done before", run_dir)
+        else:
+            begun = begin(config)
+            state = State.of(config, content(begun.module.measurements), begun.split.sha256)
+            work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
+            facts = once(run_dir, state, work, unread=unread, **how)
     figure = objective_of(config, facts["dataset/kind"])
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:

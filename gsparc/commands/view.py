@@ -22,6 +22,7 @@ from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
+from gsparc.data.limits import whole
 from gsparc.data.walls import read_walls
 from gsparc.prediction.timing import peak_memory
 
@@ -49,8 +50,7 @@ def check(save: Path | None, port: int) -> None:
     """Refuse, with `DataError`, what cannot be done before anything is read."""
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
-    if not 0 <= port < 65536:
-        raise DataError(f"port={port}: a number from 0 to 65535 is needed")
+    whole(0, 65535).check("port", port)
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
         without = "(save=picture.png and save=gaussians.ply do without)"
         raise DataError(f"viewing in a browser needs viser: pip install 'gsparc[viewer]' {without}")

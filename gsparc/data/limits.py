@@ -156,7 +156,7 @@ class Checked:
                 field.metadata["limit"].check(field.name, getattr(self, field.name))
 
 
-def check_arguments(arguments: dict[str, Any], **limits: Limit) -> None:
-    """Check arguments of a constructor by name; call it with `locals()`."""
+def check_arguments(arguments: Any, **limits: Limit) -> None:
+    """Check arguments of a function by name, of its `locals()`, or settings of a configuration."""
     for name, limit in limits.items():
         limit.check(name, arguments[name])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,10 @@ from gsparc.evaluation.scores import rows_of
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction.confidence import Trusted, gather, keep, known_positions, position_kernel, threshold_of
+from gsparc.prediction import confidence
+from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import SAME_PLACE_M
+from gsparc.prediction.refit import Learned
 from gsparc.prediction.risk import MOST_LAX_DB, Evidence, Guarantee, accept, joined, laxer, too_few
 from gsparc.training.context import FitContext
 
@@ -62,8 +64,14 @@ class Opened:
         own = {"split/foreign": self.foreign, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | own
 
-    def retraining(self, **others: Any) -> tuple[Callable[[], Method], FitContext]:
-        """What makes the method unfitted, of gsparc's classes alone, and the context that it was fitted in.
+    @property
+    def predictor(self) -> Predictor:
+        """The first method, as `gsparc.load` answers by it."""
+        site, extra = self.stored[0].site, self.stored[0].extra
+        return Predictor(self.methods[0], site, trusted=confidence.trusted_of(extra), extra=extra)
+
+    def retraining(self, **others: Any) -> Learned:
+        """The first method with what it learned from; what makes it unfitted is of gsparc's classes alone.
 
         Args:
             **others: of `FitContext`, in place of the run's.
@@ -81,7 +89,8 @@ class Opened:
             "stations": config.get("stations", "auto"),
             "split": None if split is None else split_settings(split),
         }  # fmt: skip
-        return partial(build, config["model"], trusted=False), FitContext(**own | others)
+        make, context = partial(build, config["model"], trusted=False), FitContext(**own | others)
+        return Learned(self.methods[0], make, self.data, self.split.folds[0], context)
 
 
 def open_files(
@@ -324,7 +333,7 @@ def collect(
         fold = run.split.folds[0]
         rows = np.setdiff1d(rows_of(fold, "test"), seen)
         if len(rows):
-            parts.append(gather(run.methods[0], run.data, fold, rows))
+            parts.append(confidence.gather(run.methods[0], run.data, fold, rows))
         seen = np.concatenate([seen, rows])
         facts = facts or run.facts()
     return joined(parts), facts
@@ -338,15 +347,16 @@ def store(
     kind: str,
     spatial: bool,
     seed: int,
-) -> tuple[Trusted, str]:
+) -> tuple[confidence.Trusted, str]:
     """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
-    evidence = gather(method, data, fold, rows_of(fold, "test"))
+    evidence = confidence.gather(method, data, fold, rows_of(fold, "test"))
     kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
-    threshold = threshold_of(kind_used, choice)
-    stored = Trusted(kind_used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
-    keep(path, stored)
+    threshold = confidence.threshold_of(kind_used, choice)
+    known, kernel = confidence.known_positions(data, fold), confidence.position_kernel(data, fold)
+    stored = confidence.Trusted(kind_used, threshold, promise, known, kernel)
+    confidence.keep(path, stored)
     if np.isfinite(threshold):
         return stored, f"accepted from {threshold:.4g}"
     if too_few(len(evidence), promise) is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from gsparc.data.links.stations import station_number
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.models.method import Method, Prediction, suited_threads
+from gsparc.models import checkpoint
+from gsparc.models.method import HasGaussians, Method, Prediction, suited_threads
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, mapped, transforming
@@ -26,6 +28,7 @@ from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
+    from gsparc.data.site_objects import GaussianCloud
     from gsparc.prediction.channels import Paths
     from gsparc.prediction.operating_point import Operating
 
@@ -115,6 +118,11 @@ class Predictor:
         site = of_station(self.site, number)
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, self._unit)
 
+    def in_levels(self, unit: str | None) -> Predictor:
+        """Return the same model whose powers are levels in a unit, dBm or dBW; None: as measured."""
+        method, whole, extra = self.method, self._whole, self.extra
+        return Predictor(method, self.site.in_levels(unit), whole, self.point, self.trusted, self.kind, extra)
+
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
 
@@ -199,6 +207,10 @@ class Predictor:
         own = _predicted(self._whole, query)
         sure = self._confidence(own, query)
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
+
+    def asked(self, query: Query) -> Prediction:
+        """Return what the model says of a query, whose places are local, in stored units."""
+        return _predicted(self.method, query)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
@@ -329,6 +341,17 @@ class Predictor:
         if uplink is not None:
             return channels.uplink_paths(self.method, self.site, uplink)
         return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
+
+    def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
+        """Return the Gaussians that are rendered, in the world, with what they emit for these positions.
+
+        Raises:
+            ValueError: what answers is not rendered of Gaussians.
+        """
+        if not isinstance(self.method, HasGaussians):
+            raise ValueError(f"gaussians: {self.method.name} renders none")
+        cloud = self.method.gaussians(self._query(tx, rx).query)
+        return replace(cloud, means=cloud.means + self.site.origin)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
@@ -463,6 +486,11 @@ class Predictor:
 
 
 @torch.no_grad()
+def keep(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
+    checkpoint.amend(path, extra)
+
+
 def _predicted(method: Method, query: Query) -> Prediction:
     with suited_threads(method, len(query)):
         return method.predict(query)

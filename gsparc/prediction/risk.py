@@ -15,8 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.special import betainc
-from scipy.stats import beta, chi2, spearmanr
+from scipy.stats import binomtest, chi2, spearmanr
 
+from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.data.splits import far_apart
 
 RIVALS = ("distance", "gp_variance")
@@ -59,7 +60,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
 
 
 @dataclass(frozen=True)
-class Guarantee:
+class Guarantee(Checked):
     """What is promised.
 
     >>> Guarantee(alpha=0.1, delta=0.1).least  # 0.9^22 is below 0.1
@@ -74,12 +75,8 @@ class Guarantee:
     """
 
     limit_db: float = -10.0
-    alpha: float = 0.1
-    delta: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not (0 < self.alpha < 1 and 0 < self.delta < 1):
-            raise ValueError(f"promise: alpha={self.alpha} and delta={self.delta} must lie between 0 and 1")
+    alpha: float = setting(0.1, SHARE)
+    delta: float = setting(0.1, SHARE)
 
     @property
     def least(self) -> int:
@@ -123,10 +120,8 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
     """
     if count == 0:
         return 0.0, 1.0
-    tail = (1 - level) / 2
-    low = 0.0 if errors == 0 else float(beta.ppf(tail, errors, count - errors + 1))
-    high = 1.0 if errors == count else float(beta.ppf(1 - tail, errors + 1, count - errors))
-    return low, high
+    interval = binomtest(errors, count).proportion_ci(level)
+    return float(interval.low), float(interval.high)
 
 
 def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:

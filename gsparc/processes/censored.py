@@ -21,7 +21,7 @@ FAR = -30.0  # standard deviations below which the ratio of density and distribu
 LEAST = 1e-6  # share of its variance that a factor takes away at least: none at all has no pseudo-value
 DAMPING = 0.8
 MOST_SWEEPS = 50
-SETTLED = 1e-3  # standard deviations that no mean moves by any more
+SETTLED, NEARLY = 1e-3, 1e-2  # standard deviations that no mean moves by any more; at looks of a search
 CERTAIN = 4.0  # standard deviations below its level: being told so changes nothing
 
 
@@ -58,11 +58,16 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def propagate(
-    known: ConditionalGaussian, level: Tensor, side: Tensor | float = 1.0, start: Sites | None = None
+    known: ConditionalGaussian,
+    level: Tensor,
+    side: Tensor | float = 1.0,
+    start: Sites | None = None,
+    within: float = SETTLED,
 ) -> Sites:
     """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
-    Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same.
+    Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same. They end
+    when no mean moves by more than `within` deviations.
     """
     mean, covariance = known.mean, known.covariance
     total = covariance.diagonal()
@@ -76,7 +81,7 @@ def propagate(
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
         result, wide = _sites(cavity, cavity_variance, level, side)
-        settled = bool(((cavity - before).abs() / total.sqrt()).max() < SETTLED)
+        settled = bool(((cavity - before).abs() / total.sqrt()).max() < within)
         if settled:
             break
         before = cavity
@@ -166,7 +171,8 @@ def log_evidence(
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
-    sites = propagate(known, values[unknown], side[unknown], last[0] if last else None)
+    begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
+    sites = propagate(known, values[unknown], side[unknown], begin, within)
     if last is not None:
         last[:] = [sites]
     # A stand-in is a measurement whose noise is its own variance.

@@ -7,7 +7,7 @@ matrices worth several threads go to torch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -26,7 +26,7 @@ from gsparc.processes.worker import raise_if_cancelled
 ROUNDING = torch.finfo(torch.float32).eps
 RIDGES = (0.01, 0.1, 1.0, 16.0)  # of that bound, tried in turn
 ALONE = 2_000  # rows up to which one thread is as good as several
-BANDS = 4  # of an inverse's rows, that are stored up to its diagonal
+BANDS = 8  # of an inverse's rows, that are stored up to its diagonal
 FEW = 128  # rows below which torch is as quick
 # Two threads of OpenBLAS beside other work took 10 to 400 times as long as one.
 BLAS = ThreadpoolController().select(user_api="blas")
@@ -103,21 +103,11 @@ class Factor:
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
         return self._triangular(values, adjoint=False)
 
-    def whitened_rounded(self, values: Tensor) -> Tensor:
-        """Whiten (n, R) by a stored inverse in float32: half the memory to read for few columns.
-
-        Rounding moves its squares by 1e-6 where the noise is a hundredth of the signal's variance.
-        """
-        if len(self.lower) > ALONE or followed(values):
-            return self.whitened(values)
-        single = values.float()
-        return torch.cat([part @ single[: part.shape[1]] for part in self._rounded]).to(values.dtype)
-
     @cached_property
-    def _rounded(self) -> list[Tensor]:
-        root, step = self._inverted().float(), -(-len(self.lower) // BANDS)
+    def _rounded(self) -> list[np.ndarray]:
+        root, step = self._inverted().float().numpy(), -(-len(self.lower) // BANDS)
         # A band of rows ends at its diagonal: the zeros above are neither stored nor read.
-        return [root[i : i + step, : i + step].contiguous() for i in range(0, len(root), step)]
+        return [np.ascontiguousarray(root[i : i + step, : i + step]) for i in range(0, len(root), step)]
 
     def solved(self, values: Tensor) -> Tensor:
         """Return `K^-1 V` of values (..., n, R)."""
@@ -167,6 +157,21 @@ class Factor:
         """Of K (...), float64."""
         # In float64: a sum of thousands of logarithms loses digits in float32.
         return 2 * self.lower.diagonal(dim1=-2, dim2=-1).real.double().log().sum(-1)
+
+
+def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> list[Tensor]:
+    """Whiten (n, R) by stored inverses in float32: half the memory to read for few columns.
+
+    Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
+    """
+    if followed(*values) or max(len(one.lower) for one in factors) > ALONE:
+        return [one.whitened(part) for one, part in zip(factors, values, strict=True)]
+    single, result = [part.float().numpy() for part in values], []
+    # OpenBLAS multiplies few columns in a third of torch's time.
+    with BLAS.limit(limits=1):
+        for one, part in zip(factors, single, strict=True):
+            result.append(np.concatenate([band @ part[: band.shape[1]] for band in one._rounded]))
+    return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 
 
 def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:

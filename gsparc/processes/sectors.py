@@ -7,23 +7,25 @@ TR 36.814, table A.2.1.1-2:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import apart, matern32
+from gsparc.processes.kernel import apart
 from gsparc.processes.trend import Trend
 
 ELEVATION_FLOOR_DB = 20.0
 BEARING = 0.5  # radians, over which a sector's deviations from its pattern are alike
 # Shared by all: exponent, bend [dB a squared decade], logarithms of both widths, floor [dB], tilt [deg].
-SHARED = (3.5, 0.0, 0.0, 0.0, 25.0, 0.0)
-SHARED_SPREAD = (0.7, 2.0, 0.2, 0.3, 4.0, 1.5)
+SHARED = torch.tensor((3.5, 0.0, 0.0, 0.0, 25.0, 0.0), dtype=torch.float64)
+SHARED_SPREAD = torch.tensor((0.7, 2.0, 0.2, 0.3, 4.0, 1.5), dtype=torch.float64)
 # Of a sector's own: azimuth, tilt [deg], logarithm of its width; slope [dB a decade].
-OWN_SPREAD = (5.0, 1.0, 0.1, 3.0)
+OWN_SPREAD = torch.tensor((5.0, 1.0, 0.1, 3.0), dtype=torch.float64)
+LEVEL_DB = 4.0  # of a band
 NONE = torch.zeros(0, dtype=torch.float64)
 NO_AZIMUTH = -1.0
 STEP = 0.5  # of a spread, for slopes of the mean
@@ -36,23 +38,28 @@ class Sectors(Trend):
     Attributes:
         table: (T, 5) float64: azimuth from north, tilt, widths across and in height [deg], power [dB]; one
             without azimuth has no pattern, and -1 there.
-        rank: (T,) of a sector among those of its site, and the band of each, int64.
-        band: see `rank`.
+        site: (T,) of each, and its band, int64.
+        band: see `site`.
         shared: (6,) see `SHARED`.
         levels: (bands,) at the middle distance [dB].
         doubt: (6 + bands, Q) what is uncertain of `shared_columns`, for unit normal weights of a site.
-        gain: deviation of a sector's level [dB].
         unit: deviation of the processes [dB], in which terms are.
     """
 
     table: Tensor = NONE
-    rank: Tensor = NONE
+    site: Tensor = NONE
     band: Tensor = NONE
-    shared: Tensor = NONE
+    shared: Tensor = SHARED
     levels: Tensor = NONE
     doubt: Tensor = NONE
-    gain: float = 1.0
     unit: float = 1.0
+
+    @cached_property
+    def which(self) -> tuple[Tensor, Tensor]:
+        """Return which of its site (T, R) each sector is, and of which band (T, bands), as units."""
+        rank = (self.site[:, None] == self.site).tril(-1).sum(1)
+        units = torch.nn.functional.one_hot
+        return units(rank).double(), units(self.band, len(self.levels)).double()
 
     def mean(self, places: Tensor) -> Tensor:
         """See `Trend`."""
@@ -87,55 +94,66 @@ class Sectors(Trend):
         loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
-    def shared_columns(self, places: Tensor) -> Tensor:
-        """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
-        steps = STEP * torch.tensor(SHARED_SPREAD, dtype=torch.float64).diag()
-        ends = self.at(places, self.shared + torch.cat([steps, -steps]), self.levels)
+    def slopes(self, places: Tensor) -> Tensor:
+        """Return what deviations of all shared parameters, and of a sector's own, do to means (n, 9) [dB]."""
         # Central differences, half a spread to either side.
-        result = (ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)
-        bands = torch.nn.functional.one_hot(self.band[places[:, 6].long()], len(self.levels)).to(places)
-        return torch.cat([result.T, self.gain * bands], 1)
+        steps = STEP * torch.cat([SHARED_SPREAD, OWN_SPREAD[:3]]).diag()
+        shared, own = torch.cat([steps, -steps]).split((len(SHARED), 3), 1)
+        ends = self.at(places, self.shared + shared, self.levels, own)
+        return ((ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)).T
+
+    def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
+        """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
+        slopes = self.slopes(places) if slopes is None else slopes
+        bands = self.which[1][places[:, 6].long()]
+        return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Trend`: each sector's level, azimuth, tilt, width and slope; what all share."""
+        """See `Trend`: each sector's azimuth, tilt, width and slope; what all share."""
         assert self.law is not None
-        number = places[:, 6].long()
-        steps = STEP * torch.tensor(OWN_SPREAD[:3], dtype=torch.float64).diag()
-        ends = self.at(places, self.shared, self.levels, torch.cat([steps, -steps]))
-        slope = OWN_SPREAD[3] * (self.law.decades(places) - self.middle)
-        parts = [torch.full_like(slope, self.gain), *((ends[:3] - ends[3:]) / (2 * STEP)), slope]
-        own = torch.stack(parts, 1) / self.unit
-        which = torch.nn.functional.one_hot(self.rank[number], int(self.rank.max()) + 1).to(places)
+        slopes, decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
+        parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[3] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        shared = self.shared_columns(places) @ self.doubt / self.unit
-        return torch.cat([(which[:, :, None] * own[:, None]).flatten(1), shared], 1)
+        own = (self.which[0][places[:, 6].long(), :, None] * parts[:, None]).flatten(1)
+        return torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 
 @dataclass(frozen=True)
 class SectorKernel:
-    """`amplitude (a Matern(site) + same sector (b Matern + c bearing) + noise)` of the sectors of one site.
+    """`amplitude (a exp(site) + same sector (b exp(own) + c bearing + d) + noise)` of one site's sectors.
+
+    Shadowing decays exponentially over distance (M. Gudmundson, Electronics Letters 27 (1991); 3GPP TR
+    38.901, section 7.4.4).
 
     Attributes:
         lengths: of a site's shadowing and of a sector's own [m].
-        shares: a, b, c; they sum to 1.
+        shares: a, b, c and d, of a sector's level; they sum to 1.
         noise: variance relative to `amplitude`.
         amplitude: variance of a value [dB^2].
     """
 
-    lengths: tuple[float, float]
-    shares: tuple[float, float, float]
-    noise: float
-    amplitude: float = 1.0
+    lengths: Sequence[Tensor | float]
+    shares: Sequence[Tensor | float]
+    noise: Tensor | float
+    amplitude: Tensor | float = 1.0
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (n, m) of places (n, 7) and (m, 7)."""
-        return self.of(Pairs.of(a, b), self.lengths, self.shares)
+        """Return correlations (..., n, m) of places (..., n, 7) and (..., m, 7)."""
+        distance = apart(a[..., :3], b[..., :3])
+        towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
+        # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
+        alike = (towards[0] / BEARING**2 @ towards[1].mT - 1 / BEARING**2).exp()
+        (site, sector, bearing, level), (wide, near) = self.shares, self.lengths
+        own = sector * (distance * (-1 / near)).exp() + bearing * alike + level
+        return site * (distance * (-1 / wide)).exp() + (a[..., 6:] == b[..., 6:].mT) * own
 
-    @staticmethod
-    def of(pairs: Pairs, lengths: Any, shares: Any) -> Tensor:
-        """Return the same of pairs, differentiable in lengths and shares."""
-        own = shares[1] * matern32(pairs.distance, lengths[1]) + shares[2] * pairs.alike
-        return shares[0] * matern32(pairs.distance, lengths[0]) + pairs.same * own
+    @classmethod
+    def of(cls, parameters: Tensor) -> Self:
+        """Return the kernel of logarithms (7,): lengths, variances of its parts, of the noise [dB^2]."""
+        *lengths, site, sector, bearing, level, noise = parameters.exp().unbind()
+        amplitude = site + sector + bearing + level
+        shares = [part / amplitude for part in (site, sector, bearing, level)]
+        return cls(lengths, shares, noise / amplitude, amplitude)
 
     def state(self) -> dict[str, Any]:
         """Return numbers that `read` needs."""
@@ -144,22 +162,5 @@ class SectorKernel:
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
         """Return the kernel whose `state()` this was."""
-        v = [float(value) for value in state["site_kernel"]]
-        return cls((v[0], v[1]), (v[2], v[3], v[4]), v[5], v[6])
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Of rows (n, 7) and (m, 7): distances [m], whether of one sector, and how alike their bearings are."""
-
-    distance: Tensor
-    same: Tensor
-    alike: Tensor
-
-    @classmethod
-    def of(cls, a: Tensor, b: Tensor) -> Pairs:
-        """Compare places (..., n, 7) with (..., m, 7)."""
-        towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
-        # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
-        alike = ((towards[0] @ towards[1].mT - 1) / BEARING**2).exp()
-        return cls(apart(a[..., :3], b[..., :3]), (a[..., 6:] == b[..., 6:].mT).to(a), alike)
+        v = tuple(float(value) for value in state["site_kernel"])
+        return cls(v[:2], v[2:6], v[6], v[7])

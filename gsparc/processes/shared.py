@@ -7,14 +7,14 @@ its columns, the weights' precision is I + sum V^T V (M. A. Woodbury, "Inverting
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from gsparc.processes.factor import Factor
+from gsparc.processes.factor import Factor, whitened_rounded
 from gsparc.processes.left_out import left_out
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
@@ -44,28 +44,6 @@ class Block:
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whitened(columns) / deviation, values)
 
-    @cached_property
-    def gram(self) -> Tensor:
-        """(P, P) that it adds to the precision of the weights."""
-        return self.columns.T @ self.columns
-
-
-@dataclass(frozen=True)
-class _Said:
-    """What is said of B queries of one process.
-
-    Attributes:
-        prior: of the process.
-        more: (B,) mean beyond the prior's.
-        white: (B, n) root of the variance that its rows take away; None without rows.
-        shared: (B, P) root of the variance that the shared weights leave.
-    """
-
-    prior: Prior
-    more: Tensor
-    white: Tensor | None
-    shared: Tensor
-
 
 class Shared:
     """What the rows of several processes say of shared terms, and so of each other.
@@ -85,8 +63,9 @@ class Shared:
         weights: tuple[Factor, Tensor] | None = None,
     ) -> None:
         self.processes, self.never, self.columns = processes, never, columns
+        self._alike = len({one.prior.kernel for one in processes.values()}) == 1
         self._blocks: dict[int, Block] = {}
-        self._weights: dict[int, Tensor] = {}
+        self._stacks: dict[tuple[int, ...], tuple[Tensor, ...]] = {}
         self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
 
     def block(self, number: int) -> Block:
@@ -106,51 +85,88 @@ class Shared:
         """
         own, columns = self.never.columns(queries), self.columns(queries)
         mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
-        for one in number.unique().tolist():
-            for at in (number == one).nonzero()[:, 0].split(QUERIES):
-                said = self._said(queries[at], one, own[at], columns[at], not exact and len(at) <= ROUNDED)
-                mean = mean.index_add(0, at, said.more)
-                prior = said.prior.kernel.amplitude * said.prior.variance(own[at])
-                known = prior if said.white is None else (prior - said.white.square().sum(1)).clamp_min(0.0)
-                left = left.index_add(0, at, known + said.shared.square().sum(1))
+        for asked, at in self._asked(number):
+            prior, more, white, shared = self._said(queries[at], asked, own[at], columns[at], not exact)
+            there = at >= 0
+            at = at[there]
+            spread = prior.kernel.amplitude * prior.variance(own[at])
+            if white:
+                known = torch.stack([one.square().sum(1) for one in white])
+                spread = (spread - known[there]).clamp_min(0.0)
+            mean = mean.index_add(0, at, more[there])
+            left = left.index_add(0, at, spread + shared.square().sum(2)[there])
         return mean, left
 
     def together(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         own = self.never.columns(flat)
-        said = self._said(flat, number, own, self.columns(flat))
-        terms, kernel = own.unflatten(0, groups), said.prior.kernel
+        asked = flat[None], (number,), own[None], self.columns(flat)[None]
+        prior, more, white, shared = self._said(*asked, rounded=False)
+        terms, kernel = own.unflatten(0, groups), prior.kernel
         left = kernel.between(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
-        for root, sign in ((said.white, -1), (said.shared, 1)):
-            if root is not None:
-                each = root.unflatten(0, groups)
-                left = left + sign * each @ each.mT
-        mean = self.never.mean(flat)[:, 0] + said.more
+        for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
+            each = root.unflatten(0, groups)
+            left = left + sign * each @ each.mT
+        mean = self.never.mean(flat)[:, 0] + more[0]
         return mean.unflatten(0, groups), left
 
+    def _asked(self, number: Tensor) -> Iterator[tuple[tuple[int, ...], Tensor]]:
+        """Processes and their queries (S, k), -1 in place of none: all at once where each is asked little."""
+        order = number.argsort(stable=True)
+        which, count = number[order].unique_consecutive(return_counts=True)
+        numbers, at = which.tolist(), order.split(count.tolist())
+        if self._alike and numbers == sorted(self.processes) and max(map(len, at)) <= ROUNDED:
+            yield tuple(numbers), pad_sequence(at, batch_first=True, padding_value=-1)
+            return
+        for one, own in zip(numbers, at, strict=True):
+            yield from (((one,), part[None]) for part in own.split(QUERIES))
+
     def _said(
-        self, queries: Tensor, number: int, own: Tensor, columns: Tensor, rounded: bool = False
-    ) -> _Said:
-        """By one process; `own` (B, Q) and `columns` (B, P) are terms at the queries."""
-        if number not in self.processes:
-            return _Said(self.never, columns @ self.mean, None, self.factor.whitened(columns.T).T)
-        block = self.block(number)
-        prior = block.process.prior
-        cross = deviation_of(prior) * block.process.cross(queries, own)
-        factor = block.process.factor
-        # With less noise float32's rounding would show in the variance.
-        rounded &= prior.kernel.noise >= ROUNDED_FROM
-        white = (factor.whitened_rounded if rounded else factor.whitened)(cross.T).T
-        if number not in self._weights:
-            rest = (block.values - block.columns @ self.mean)[:, None]
-            # The rest is whitened: K^-1 L rest = L^-T rest.
-            self._weights[number] = factor.solved(factor.lower @ rest)[:, 0]
-        more = columns @ self.mean + cross @ self._weights[number]
-        if not len(self.mean):
-            return _Said(prior, more, white, columns)
-        return _Said(prior, more, white, self.factor.whitened((columns - white @ block.columns).T).T)
+        self, queries: Tensor, asked: tuple[int, ...], own: Tensor, columns: Tensor, rounded: bool
+    ) -> tuple[Prior, Tensor, list[Tensor], Tensor]:
+        """What S processes of one prior say at (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P).
+
+        The prior; the mean (S, k) beyond its; roots (k, n) of each of the variance that rows take away, none
+        without rows; and (S, k, P) of that which the shared weights leave.
+        """
+        more, shared = columns @ self.mean, columns.flatten(0, 1)
+        prior, white = self.never, list[Tensor]()
+        if asked[0] in self.processes:
+            prior = self.processes[asked[0]].prior
+            places, terms, weights = self._stack(asked)
+            cross = deviation_of(prior) * (prior.kernel.between(queries, places) + own @ terms.mT)
+            more = more + (cross @ weights)[..., 0]
+            # With less noise float32's rounding would show in the variance.
+            rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
+            blocks = [self.block(one) for one in asked]
+            factors = [block.process.factor for block in blocks]
+            parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
+            if rounded:
+                white = [one.T for one in whitened_rounded(factors, parts)]
+            else:
+                white = [one.whitened(part).T for one, part in zip(factors, parts, strict=True)]
+            if len(self.mean):
+                told = [one @ block.columns for one, block in zip(white, blocks, strict=True)]
+                shared = shared - torch.cat(told)
+        if len(self.mean):
+            shared = self.factor.whitened(shared.T).T
+        return prior, more, white, shared.unflatten(0, queries.shape[:2])
+
+    def _stack(self, asked: tuple[int, ...]) -> tuple[Tensor, ...]:
+        """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""
+        if asked not in self._stacks:
+            parts = []
+            for one in asked:
+                block, process = self.block(one), self.processes[one]
+                rest = (block.values - block.columns @ self.mean)[:, None]
+                # The rest is whitened: K^-1 L rest = L^-T rest.
+                weights = process.factor.solved(process.factor.lower @ rest)
+                parts.append((process.rows, process.prior.columns(process.rows), weights))
+            padded = (pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True))
+            self._stacks[asked] = tuple(padded)
+        return self._stacks[asked]
 
     @torch.no_grad()
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:
@@ -171,7 +187,8 @@ def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
     """Return the factor of the precision (P, P) of the shared weights, and their mean (P,)."""
     size = blocks[0].columns.shape[1]
     # From the identity, the precision of unit normal weights before any row.
-    precision = sum((block.gram for block in blocks), torch.eye(size, dtype=torch.float64))
+    grams = (block.columns.T @ block.columns for block in blocks)
+    precision = sum(grams, torch.eye(size, dtype=torch.float64))
     factor = Factor.of(precision, "raise")
     right = torch.stack([block.columns.T @ block.values for block in blocks]).sum(0)
     return factor, factor.solved(right[:, None])[:, 0]

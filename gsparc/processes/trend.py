@@ -6,7 +6,7 @@ The multi-wall model (COST Action 231, "Digital mobile radio towards future gene
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import torch
@@ -145,7 +145,8 @@ class Trend(Columns):
     def state(self) -> dict[str, Any]:
         """See `Term`."""
         law = None if self.law is None else self.law.state()
-        return {**vars(self), "law": law, "more": [stored(term) for term in self.more]}
+        numbers = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**numbers, "law": law, "more": [stored(term) for term in self.more]}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Self:

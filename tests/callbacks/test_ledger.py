@@ -16,27 +16,18 @@ def clock(monkeypatch):
 
 def trainer(callbacks=(), **figures) -> SimpleNamespace:
     return SimpleNamespace(
-        callbacks=list(callbacks),
-        callback_metrics=figures,
-        sanity_checking=False,
-        is_global_zero=True,
-        global_step=7,
-        loggers=[],
-        state=SimpleNamespace(fn="fit"),
-    )
+        callbacks=list(callbacks), callback_metrics=figures, sanity_checking=False, is_global_zero=True,
+        global_step=7, loggers=[], state=SimpleNamespace(fn="fit"),
+    )  # fmt: skip
 
 
 @pytest.fixture
 def module(tmp_path):
     figures = {"val/error": 0.25, "val/psnr_db": 21.5}
     return SimpleNamespace(
-        run_dir=tmp_path / "new",
-        train_seconds=0.0,
-        prepared_seconds=0.0,
-        figures=figures,
-        count=40,
+        run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0, figures=figures, count=40,
         start="start",
-    )
+    )  # fmt: skip
 
 
 def test_validation_and_pictures_are_not_billed(clock, module):
@@ -79,9 +70,8 @@ def test_the_curve_has_accuracy_beside_seconds(clock, module):
     rows = curve.read(module.run_dir)
     assert [row["seconds"] for row in rows] == ["0.0", "2.0", "4.0"]
     assert [row["what"] for row in rows] == ["start", "step 7", "step 14"]
-    assert (
-        rows[0]["val/psnr_db"] == "21.5" and rows[0]["error"] == "0.25" and rows[0]["num_gaussians"] == "40"
-    )
+    assert rows[0]["val/psnr_db"] == "21.5" and rows[0]["error"] == "0.25"
+    assert rows[0]["num_gaussians"] == "40"
 
 
 def test_the_curve_of_a_resumed_run_ends_with_its_checkpoint(clock, module):

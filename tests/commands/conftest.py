@@ -1,13 +1,12 @@
 """Fields of a second, trained once for all commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 from access_points import walks
 from campaigns import brief, compose, spectra
+from towns import trained
 
 from gsparc.commands.train import Objects, train
 
@@ -35,10 +34,7 @@ def halfway(spectra_file, tmp_path_factory) -> Objects:
 @pytest.fixture(scope="session")
 def spectra_gp(tmp_path_factory) -> Path:
     """A checkpoint of `gp` on eighty such spectra."""
-    folder = tmp_path_factory.mktemp("gp")
-    file = spectra(folder / "own.npz", rows=80)
-    train(compose("dataset=own", f"dataset.file='{file}'", "model=gp", "baselines=[]", "logger=none"), folder)
-    return folder / "model.ckpt"
+    return trained(spectra(tmp_path_factory.mktemp("gp") / "own.npz", rows=80), "gp")
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """Risk and coverage, thresholds with a promise, and whether promises hold."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -13,7 +11,6 @@ from campaigns import brief, compose, spectra
 from gsparc.commands.calibrate import tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.data.splits import far_apart
 from gsparc.evaluation import open_runs as command
 from gsparc.evaluation.open_runs import collect
 from gsparc.evaluation.pictures import draw_calibration
@@ -86,14 +83,17 @@ def test_too_few_to_test_promise_nothing() -> None:
     score = np.linspace(1, 0, 15)
     found = choose(score, np.zeros(15, bool), levels_of(score), Guarantee(alpha=0.1, delta=0.1))
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        Guarantee(alpha=1.5)
 
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
-    for name in ("rows_of", "known_positions", "position_kernel", "keep"):
-        monkeypatch.setattr(command, name, lambda *_: None)
-    monkeypatch.setattr(command, "gather", lambda *_: evidence)
+    monkeypatch.setattr(command, "rows_of", lambda *_: None)
+    for name in ("known_positions", "position_kernel", "keep"):
+        monkeypatch.setattr(command.confidence, name, lambda *_: None)
+    monkeypatch.setattr(command.confidence, "gather", lambda *_: evidence)
     how = "auto", False, 0
     stored, said = command.store("", {}, {}, Guarantee(-40.0), *how)
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
@@ -124,13 +124,6 @@ def test_parts_are_disjoint_and_cells_stay_whole() -> None:
     assert len(names[1] & names[2]) < 8  # only where the cells above differ by rounding at their edges
 
 
-def test_thinned_rows_keep_their_distance() -> None:
-    evidence = _evidence()
-    kept = far_apart(evidence.position, np.arange(300), 0.3, np.random.default_rng(0))
-    apart = np.linalg.norm(evidence.position[kept][:, None] - evidence.position[kept], axis=-1)
-    assert apart[np.triu_indices(len(kept), 1)].min() > 0.3
-
-
 def test_evidence_of_a_method(campaign, folds) -> None:
     from gsparc.models.baselines.gp import GaussianProcess
     from gsparc.models.baselines.mean import Mean
@@ -144,11 +137,6 @@ def test_evidence_of_a_method(campaign, folds) -> None:
         found = gather(method, data, fold, fold.test)
         assert set(found.scores) == kinds and (found.scores["distance"] <= 0).all()
     assert len(joined([found, found])) == 2 * len(fold.test)
-
-
-def test_impossible_promises_are_refused() -> None:
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        Guarantee(alpha=1.5)
 
 
 MUTE = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1)

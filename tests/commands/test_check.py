@@ -35,14 +35,11 @@ def test_good_file_is_described(tmp_path, arrays):
         assert words in text, text
 
 
-@pytest.mark.parametrize(
-    ("change", "warning"),
-    [
-        ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
-        ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
-        ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
-    ],
-)
+@pytest.mark.parametrize(("change", "warning"), [
+    ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
+    ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
+    ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
+])  # fmt: skip
 def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, change, warning, caplog):
     """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
@@ -51,17 +48,6 @@ def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, ch
     assert good and warning in text
     load({"name": "own", "file": str(tmp_path / "a.npz")})
     assert warning in caplog.text
-
-
-def test_degrees_in_place_of_metres_were_good(tmp_path):
-    """They were looked for among coordinates about the middle of the site."""
-    rng = np.random.default_rng(0)
-    place = np.column_stack([rng.uniform(40.76, 40.8, 50), rng.uniform(-111.84, -111.8, 50), np.ones(50)])
-    arrays = {"rx_position": place, "tx_position": np.array([40.77, -111.8, 9.0])}
-    write_own(tmp_path / "a.npz", {**arrays, "rssi_db": rng.uniform(-90, -60, 50)})
-    assert "degrees? then give them as latitude and longitude" in _said(tmp_path / "a.npz")[1].replace(
-        "\n", ""
-    )
 
 
 def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):

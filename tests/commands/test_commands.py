@@ -1,7 +1,5 @@
 """`gsparc COMMAND key=value ...`: the list, a typo, the help of every command, an interrupt."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import re
@@ -13,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import Mock
 
 import pytest
+from campaigns import compose
 from doors import Answer, knock
 
 from gsparc.__main__ import READER_LEFT, main
@@ -90,6 +89,7 @@ def test_a_reader_that_leaves_early_is_no_error(words):
 def test_files_need_no_name_where_a_command_is_about_files(tmp_path):
     given = ["a b", "c", "title=x", "-m"]
     assert COMMANDS["report"].arguments(given) == ["title=x", "-m", "runs=['a b','c']"]
+    assert compose(*COMMANDS["report"].arguments(["it's, here"]), config="report").runs == ["it's, here"]
     assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
     answer = gsparc("check", str(tmp_path / "absent.npz"))
     assert answer.status == 1 and "no such file" in answer.out[0]
@@ -143,16 +143,13 @@ def with_advice(config):
     raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
 
-@pytest.mark.parametrize(
-    ("task", "line"),
-    [
-        (while_a_library_cleans_up, "error: interrupted"),
-        (in_compiled_code, "error: interrupted: Invalid bounding box"),
-        (while_it_logs, "error: interrupted"),
-        (while_a_log_waits_for_its_reader, "error: interrupted"),
-        (with_advice, "error: go on with ckpt_path=last.ckpt"),
-    ],
-)
+@pytest.mark.parametrize(("task", "line"), [
+    (while_a_library_cleans_up, "error: interrupted"),
+    (in_compiled_code, "error: interrupted: Invalid bounding box"),
+    (while_it_logs, "error: interrupted"),
+    (while_a_log_waits_for_its_reader, "error: interrupted"),
+    (with_advice, "error: go on with ckpt_path=last.ckpt"),
+])  # fmt: skip
 def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeypatch, tmp_path):
     monkeypatch.setattr("gsparc.commands.train.task", task)
     before = signal.getsignal(signal.SIGINT)

@@ -1,7 +1,5 @@
 """The command: fills what is missing, finds what is there, goes on after a failure."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The configuration: every choice composes and builds; sweeps have directories of their own."""
 
-from __future__ import annotations
-
 import re
 from inspect import signature
 from pathlib import Path

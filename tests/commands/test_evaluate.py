@@ -1,7 +1,5 @@
 """The command: a checkpoint and a folder in, summary.json and a table out, one line on error."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -11,13 +9,13 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+import towns
 import yaml
-from campaigns import channels, compose
+from campaigns import channels
 from doors import assert_refused, knock
 
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.train import train
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint, loading
 
@@ -25,9 +23,8 @@ from gsparc.models import checkpoint, loading
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A checkpoint of the nearest channel in a small room."""
-    folder = tmp_path_factory.mktemp("evaluate")
-    given = f"dataset.file={channels(folder / 'own.npz')}", "model=nearest", "baselines=[]", "logger=none"
-    return train(compose("dataset=own", *given, "seed=3", "threads=1"), folder)[1].checkpoints[0]
+    file = channels(tmp_path_factory.mktemp("evaluate") / "own.npz")
+    return towns.trained(file, "nearest", "seed=3", "threads=1")
 
 
 def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
@@ -98,15 +95,13 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
     """The baselines knew the new file, the model did not."""
     (tmp_path / "later").mkdir()
     file, later = channels(tmp_path / "own.npz"), tmp_path / "later" / "own.npz"
-    config = compose("dataset=own", f"dataset.file={file}", "model=nearest", "baselines=[]", "logger=none")
-    model = train(config, tmp_path / "run")[1].checkpoints[0]
+    model = towns.trained(file, "nearest")
     with np.load(file) as stored:
         moved = stored["rx_position"] + [0.02, 0.01, 0]
         np.savez(later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)})
     found, data, split = evaluate_files([model], {"file": str(later)}, {"name": None})
-    assert (
-        split.name == "whole" and found.facts["test/samples"] == found.facts["split/test"] == len(data) == 80
-    )
+    assert split.name == "whole"
+    assert found.facts["test/samples"] == found.facts["split/test"] == len(data) == 80
     assert "baseline/nearest/nmse" not in found.facts  # as asked
     found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)
     assert found.facts["test/nmse"] == found.facts["baseline/nearest/nmse"] > 0.5
@@ -119,9 +114,8 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
         evaluate_files([model], {"file": str(later)}, eval_on="val")
     file.unlink()
     found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)
-    assert (
-        not [name for name in found.facts if name.startswith("baseline/")] and found.facts["test/nmse"] > 0.5
-    )
+    assert not [name for name in found.facts if name.startswith("baseline/")]
+    assert found.facts["test/nmse"] > 0.5
     assert "no baselines: the file that the model was trained on is gone, or another" in remarks(found.facts)
 
 

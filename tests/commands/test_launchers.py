@@ -1,7 +1,5 @@
 """A sweep through a launcher loses a job: the same command goes on with it, and nothing is done twice."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,21 +1,16 @@
 """`gsparc locate` from a trained model or a file of fingerprints to its files."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil
 
 import numpy as np
 import pytest
+import towns
 from campaigns import compose, powers, spectra
 from PIL import Image
 
-from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.locator import trust_state
-from gsparc.apps.locate.search import Unknown
 from gsparc.commands.locate import locate
-from gsparc.commands.train import train
 from gsparc.models import checkpoint
 
 UNPLACED = {"x", "y", "z", "area_m2", "modes"}
@@ -72,13 +67,6 @@ def test_a_file_without_places_is_located_too(trained, tmp_path):
     assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
 
 
-def test_trust_of_other_settings_is_not_taken_in_silence(trained, tmp_path):
-    """`calibrate=0 share=0.5` used the level that was learned for 90 % of places."""
-    checkpoint.amend(trained, trust_state(Trust(level=0.95), Unknown(), 0.9))
-    with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
-        located(tmp_path, f"ckpt={trained}", "calibrate=0", "share=0.5")
-
-
 def test_nobody_is_located_in_a_wall(trained, tmp_path):
     plan = np.full((40, 100, 3), 255, np.uint8)
     plan[:, 50:] = 0  # the right half of the room
@@ -98,11 +86,9 @@ def test_a_track_of_a_trained_model(trained, tmp_path):
 
 
 def test_a_method_without_variance_is_refused_in_one_line(tmp_path):
-    file = powers(tmp_path / "own.npz")
-    chosen = f"dataset.file='{file}'", "model=idw", "baselines=[]", "logger=none"
-    train(compose("dataset=own", *chosen), tmp_path)
+    ckpt = towns.trained(powers(tmp_path / "own.npz"), "idw")
     with pytest.raises(ValueError, match="idw states no variance"):
-        located(tmp_path / "run", f"ckpt={tmp_path}/model.ckpt", "calibrate=0")
+        located(tmp_path / "run", f"ckpt={ckpt}", "calibrate=0")
 
 
 def test_fingerprints_from_a_file_to_places(hall, tmp_path):

@@ -1,7 +1,5 @@
 """`gsparc map` and `gsparc plan`: files whole, a promise kept with the model, errors in one line."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Every command that a page or a configuration shows ends well on small data of its kind."""
 
-from __future__ import annotations
-
 import pytest
 from doors import knock
 from pages import Tiny, commands

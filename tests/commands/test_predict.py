@@ -1,7 +1,5 @@
 """From a table of places to a table of predictions, in degrees and in metres."""
 
-from __future__ import annotations
-
 import csv
 import logging
 from pathlib import Path
@@ -249,21 +247,17 @@ BAD_TABLES = {
     "infinite": ("lat,lon,height\n47,11,inf\n", r"column 'height', line 2: 'inf'"),
     "no rows": ("lat,lon,height\n", r"there are no rows below it"),
     "empty": ("", r"empty"),
-    "no coordinates": (
-        "time,speed\n1,2\n",
-        r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat",
-    ),
+    "no coordinates": ("time,speed\n1,2\n",
+        r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat"),
     "half": ("lat,height\n47,2\n", r"latitude is there but no longitude; say columns\.longitude=COLUMN"),
     "far": ("x,y,z\n1,1,2\n2e7,0,2\n", r"line 3: \(2e\+07, 0, 2\) is more than 10000 km"),
     "the other side": ("lat,lon,height\n-47,-169,2\n", r"line 2: .*more than 10000 km"),
     "high": ("lat,lon,height\n47,11,1e9\n", r"line 2: .*more than 10000 km"),
     "another end": ("tx_lat,tx_lon\n47,11\n", r"no coordinates of the receiver"),
     "no station": ("lat,lon,height,cell\n47,11,2,\n", r"column 'cell', line 2: no station"),
-    "two columns": (
-        "lat,latitude (deg),lon,height\n1,1,1,1\n",
-        r"could each be latitude; say which: columns\.",
-    ),
-}
+    "two columns": ("lat,latitude (deg),lon,height\n1,1,1,1\n",
+        r"could each be latitude; say which: columns\."),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD_TABLES)
@@ -380,15 +374,11 @@ def test_channels(tmp_path, shape, heads):
 
 TONES = {"frequency_hz": 2.4e9 + 1e6 * np.arange(5)}
 UNTABLED = {
-    "csi": (
-        {"csi": np.ones((60, 4, 5), complex), **TONES},
-        r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz",
-    ),
-    "spectrum": (
-        {"spectrum": np.random.default_rng(0).uniform(0, 1, (60, 12, 24))},
-        r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz",
-    ),
-}
+    "csi": ({"csi": np.ones((60, 4, 5), complex), **TONES},
+        r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz"),
+    "spectrum": ({"spectrum": np.random.default_rng(0).uniform(0, 1, (60, 12, 24))},
+        r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", UNTABLED)

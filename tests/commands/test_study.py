@@ -1,7 +1,5 @@
 """`gsparc study`: each kind leaves its table, figure and summary."""
 
-from __future__ import annotations
-
 import csv
 import json
 
@@ -14,13 +12,10 @@ from gsparc.models.terms import EffectSettings
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
     "effects": (["base=plain"], ["none"], "study/plain/psnr_db"),
-    "positions": (
-        ["kind.errors_m=[0.1]"],
-        ["none", "query", "train", "train_known"],
-        "study/mean/query/0.1/psnr_db",
-    ),
+    "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train", "train_known"],
+        "study/mean/query/0.1/psnr_db"),
     "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"], "study/mean/keep/0.5/train_s"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", LINES)

@@ -1,7 +1,5 @@
 """`gsparc tradeoff`: a table, a picture, points kept; and loading within a budget."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json
@@ -40,7 +38,13 @@ def swept(field, tmp_path_factory):
         said: list[tuple] = []
         patch.setattr(tracking, "table", lambda loggers, *table: said.append((len(loggers), *table)))
         config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}
-        return task(config), folder, ckpt, said
+        facts = task(config)
+        monkey = {"in_multirun": lambda: True, "_swept": None}  # which is not called
+        with pytest.MonkeyPatch.context() as second:
+            for name, value in monkey.items():
+                second.setattr(f"gsparc.commands.tradeoff.{name}", value)
+            assert task(config) == facts, "a job of a multirun is done once, though the front is in its ckpt"
+        return facts, folder, ckpt, said
 
 
 def test_dashboards_get_the_points_that_nothing_beats(swept):

@@ -1,7 +1,5 @@
 """`train()` and its command, end to end on files of a second."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -31,7 +29,7 @@ from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.metric_formats import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
@@ -42,18 +40,8 @@ from gsparc.training import curve
 from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
-CONTRACT = {  # what scripts read of a summary
-    "time/train_s", "time/render_ms_p50", "time/render_ms_p95", "time/includes", "machine/threads",
-    "machine/load", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
-    "dataset/sha256", "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256", "seed",
-    "git", "versions",
-}  # fmt: skip
-FIGURES = {
-    "spectrum": {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "nmse", "skill"},
-    "csi": {"nmse", "snr_db", "skill", "nmse_scalar"},
-    "rssi": {"rmse_db", "nmse", "skill"},
-}
-PAIRED = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": None}
+
+
 KINDS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 STILL = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
          "opacities", "emission", "confidence", "gain")]  # fmt: skip
@@ -79,14 +67,12 @@ def steps(folder: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
+def test_a_run_leaves_facts_and_files(kind, tmp_path):
+    """What `evaluate` finds, and beside it what a training alone knows."""
     file = KINDS[kind](tmp_path / "own.npz")
     facts, objects = train(compose(*brief(file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert set(stored) >= CONTRACT and {f"test/{name}" for name in FIGURES[kind]} <= set(stored)
-    assert {"baseline/nearest/skill", "baseline/gp/train_s", "baseline/mean/render_ms_p50"} <= set(stored)
-    if PAIRED[kind]:
-        assert {f"paired/gp/{PAIRED[kind]}", f"paired/gp/{PAIRED[kind]}_se"} <= set(stored)
+    assert {"seed", "git", "versions", "memory/peak_mb", "paired/gp/nmse", "test/skill"} <= set(stored)
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
@@ -250,16 +236,13 @@ def test_a_run_goes_on_with_the_same_grid_or_not_at_all(spectra_file, halfway, t
         train(short(tmp_path / "own.npz", f"ckpt_path={last}"), tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("what", "change"),
-    [
-        ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
-        ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
-        ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
-        ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
-        ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
-    ],
-)
+@pytest.mark.parametrize(("what", "change"), [
+    ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
+    ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
+    ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
+    ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
+    ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
+])  # fmt: skip
 def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, what, change):
     data = load_data({"name": "own", "file": str(spectra_file)})
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
@@ -371,14 +354,11 @@ def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp
 # -- options of the Trainer, and Lightning's own way to a model -------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "validated"),
-    [
-        (["trainer=debug"], [1]),
-        (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
-        (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
-    ],
-)
+@pytest.mark.parametrize(("options", "validated"), [
+    (["trainer=debug"], [1]),
+    (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
+    (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
+])  # fmt: skip
 def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_file, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     facts, _ = train(short(spectra_file, *options), tmp_path)
@@ -452,15 +432,6 @@ def test_the_objective_is_a_figure_of_the_kind():
         said = r"objective=val/nmsee: no such figure; did you mean 'val/nmse'\?"
         with pytest.raises(ValueError, match=said):
             objective_of(config, kind)
-
-
-def test_every_figure_grows_when_the_prediction_is_better():
-    """Each of them by name: what is not listed as smaller-is-better is maximised."""
-    better_is_larger = {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "snr_db"}
-    better_is_larger |= {f"snr_db_p{p}" for p in (10, 50, 90)}
-    for figure in (figure for kind in DECIDING for figure in figure_names(kind)):
-        assert lower_is_better(figure) == (figure not in better_is_larger), figure
-        assert (score_of(figure, 0.2) > score_of(figure, 0.1)) == (figure in better_is_larger)
 
 
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])

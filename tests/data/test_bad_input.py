@@ -126,27 +126,21 @@ def test_own_spectrum(spectrum_arrays, refused, case):
     refused(says, from_arrays, spoil(spectrum_arrays))
 
 
-@pytest.mark.parametrize(
-    ("attributes", "says"),
-    [
-        ({"normalisation": "maximum"}, "expected one of max, minmax"),
-        ({"convergence_error": -1.0}, "at least 0"),
-        ({"convergence_error": "low"}, "finite number"),
-        ({"measurement": "spectra"}, "'spectra' names no measurement of this file, which holds spectrum"),
-    ],
-)
+@pytest.mark.parametrize(("attributes", "says"), [
+    ({"normalisation": "maximum"}, "expected one of max, minmax"),
+    ({"convergence_error": -1.0}, "at least 0"),
+    ({"convergence_error": "low"}, "finite number"),
+    ({"measurement": "spectra"}, "'spectra' names no measurement of this file, which holds spectrum"),
+])  # fmt: skip
 def test_attributes(spectrum_arrays, refused, attributes, says):
     refused(says, from_arrays, spectrum_arrays, attributes)
 
 
-@pytest.mark.parametrize(
-    ("powers", "says"),
-    [
-        ({"rssi_db": [-50, -60, 4000, -70.0]}, "row 2: out of range; expected dB"),
-        ({"rssi": [-50, -60, -70, -70.0]}, "linear power"),
-        ({"rssi_db": [-50, -60, -40, -70.0], "noise_variance": 1.0}, "cannot go with rssi_db"),
-    ],
-)
+@pytest.mark.parametrize(("powers", "says"), [
+    ({"rssi_db": [-50, -60, 4000, -70.0]}, "row 2: out of range; expected dB"),
+    ({"rssi": [-50, -60, -70, -70.0]}, "linear power"),
+    ({"rssi_db": [-50, -60, -40, -70.0], "noise_variance": 1.0}, "cannot go with rssi_db"),
+])  # fmt: skip
 def test_powers_beyond_reason(refused, powers, says):
     rows = {"rx_position": np.arange(12.0).reshape(4, 3), "tx_position": np.zeros(3)}
     refused(says, from_arrays, rows | {name: np.array(value) for name, value in powers.items()})
@@ -239,21 +233,18 @@ def test_many_bad_rows_stay_readable():
     assert len(problems) == Problems.LIMIT + 1 and "5995 more rows" in problems[-1]
 
 
-@pytest.mark.parametrize(
-    "text,says",
-    [
-        ("[" * 50_000, "brackets within brackets, too many"),
-        ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
-        ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
-        ("[1]", "expected a JSON table as text .found a list"),
-        ("{", "expected a JSON table"),
-        ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
-        ('{"units": [1]}', "units is not a table"),
-        ('{"name": [1]}', "name: a list; expected text"),
-        ('{"stand_in": 5}', "stand_in: a int; expected text"),
-        ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
-    ],
-)
+@pytest.mark.parametrize("text,says", [
+    ("[" * 50_000, "brackets within brackets, too many"),
+    ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
+    ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
+    ("[1]", "expected a JSON table as text .found a list"),
+    ("{", "expected a JSON table"),
+    ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
+    ('{"units": [1]}', "units is not a table"),
+    ('{"name": [1]}', "name: a list; expected text"),
+    ('{"stand_in": 5}', "stand_in: a int; expected text"),
+    ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
+])  # fmt: skip
 def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     """Brackets ended `gsparc check` in a traceback; lists and truth values passed."""
     np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)

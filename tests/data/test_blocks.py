@@ -1,7 +1,5 @@
 """Measurements too large for memory: read from where they are, block by block, and the same as in memory."""
 
-from __future__ import annotations
-
 import hashlib
 import multiprocessing
 import pickle
@@ -138,23 +136,14 @@ def unwritten(path, rows=10**12, **more):
     return path
 
 
-@pytest.mark.parametrize(
-    ("rows", "more", "says"),
-    [
-        (
-            10**12,
-            {"csi": "c8"},
-            r"csi: shape .1000000000000,., 8,000,000,000,000 bytes: a file of .* does not hold",
-        ),
-        (10**11, {"csi": "f4", "rx_position": "f8"}, "rx_position: shape .* does not hold that"),
-        (10**11, {"row_name": h5py.string_dtype()}, "row_name: shape .* does not hold that"),
-        (
-            10**8,
-            {f"extra{n}": "u1" for n in range(40)},
-            "shape .100000000,., 100,000,000 bytes: .* does not hold",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("rows", "more", "says"), [
+    (10**12, {"csi": "c8"},
+        r"csi: shape .1000000000000,., 8,000,000,000,000 bytes: a file of .* does not hold"),
+    (10**11, {"csi": "f4", "rx_position": "f8"}, "rx_position: shape .* does not hold that"),
+    (10**11, {"row_name": h5py.string_dtype()}, "row_name: shape .* does not hold that"),
+    (10**8, {f"extra{n}": "u1" for n in range(40)},
+        "shape .100000000,., 100,000,000 bytes: .* does not hold"),
+])  # fmt: skip
 @pytest.mark.parametrize("name", ["own.h5", "own.nc"])
 def test_an_array_that_was_never_written_filled_the_disk(
     tmp_path, monkeypatch, refused, rows, more, says, name

@@ -1,7 +1,5 @@
 """Rows of Parquet merged by cells while they are read: the means of all of them, whatever the files."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -66,16 +64,13 @@ def test_degrees_are_cells_of_metres(tmp_path):
     assert abs(cells - 32 * 32) <= 2 * 32 + 1  # a border may be cut
 
 
-@pytest.mark.parametrize(
-    ("change", "cell_m", "said"),
-    [
-        ({"rssi [dBm]": "loud"}, 5.0, "damaged or not a Parquet file .*loud"),
-        ({"rssi [dBm]": None, "rssi [W]": 1e-9}, 5.0, r"dataset.columns.rssi_db=COLUMN"),
-        ({"x": None}, 5.0, "no x; say"),
-        ({}, 0.0, "dataset.cell_m=0.0"),
-        ({}, None, "dataset.cell_m"),
-    ],
-)
+@pytest.mark.parametrize(("change", "cell_m", "said"), [
+    ({"rssi [dBm]": "loud"}, 5.0, "damaged or not a Parquet file .*loud"),
+    ({"rssi [dBm]": None, "rssi [W]": 1e-9}, 5.0, r"dataset.columns.rssi_db=COLUMN"),
+    ({"x": None}, 5.0, "no x; say"),
+    ({}, 0.0, "dataset.cell_m=0.0"),
+    ({}, None, "dataset.cell_m"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused(frame, tmp_path, change, cell_m, said):
     changed = frame.assign(**{name: value for name, value in change.items() if value is not None})
     changed = changed.drop(columns=[name for name, value in change.items() if value is None])

@@ -1,7 +1,5 @@
 """Slips of a unit or of a column, at every door that measurements come in by."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 from pathlib import Path

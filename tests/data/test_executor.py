@@ -1,7 +1,5 @@
 """Pieces of work: the same results wherever they are done, each stored once though its process dies."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

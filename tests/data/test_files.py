@@ -1,7 +1,5 @@
 """Whole or not at all."""
 
-from __future__ import annotations
-
 import pytest
 from doors import assert_refused, knock
 

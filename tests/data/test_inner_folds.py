@@ -1,7 +1,5 @@
 """Folds inside the training rows are cut as the test rows were cut from all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree

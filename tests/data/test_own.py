@@ -15,18 +15,14 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
     mask[3, 0] = False
     csi_arrays["csi"][3, 0] = np.nan
     arrays = {
-        **csi_arrays,
-        "mask": mask,
-        "noise_variance": np.float64(0.02),
-        "position_std": np.linspace(0, 0.1, 12),
-        "row_name": np.array(["ä"] * 12),
-    }
+        **csi_arrays, "mask": mask, "noise_variance": np.float64(0.02),
+        "position_std": np.linspace(0, 0.1, 12), "row_name": np.array(["ä"] * 12),
+    }  # fmt: skip
     written = write_own(path, arrays, {"name": "garage", "operator": "me", "convergence_error": 0.01})
     read = load_own(path)
     assert read.site.sha256 == written.site.sha256 and read.site.name == "garage"
-    assert (
-        read.site.static_end == "tx" and read.target.shape == (12, 2, 3) and read.target.dtype == np.complex64
-    )
+    assert read.site.static_end == "tx" and read.target.shape == (12, 2, 3)
+    assert read.target.dtype == np.complex64
     assert read.provenance == {"operator": "me"} and read.site.convergence_error == 0.01
     assert read.row_names[0] == "ä" and not read.mask[3, 0].any()
     physical = read.target * read.site.target_scale

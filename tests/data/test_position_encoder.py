@@ -1,7 +1,5 @@
 """The encoder: blind to what is the snapshot's own, spread out, frozen, and nearer the truth than a guess."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -95,15 +95,8 @@ def test_slots_of_neighbours_become_rows(tmp_path):
     one = network(0)
     order = np.argsort(-one.measured, 1)[:100, :3]
     heads = [
-        "x",
-        "y",
-        "Serving PCI",
-        "Serving RSRP [dBm]",
-        "N1 PCI",
-        "N1 RSRP [dBm]",
-        "N2 PCI",
-        "N2 RSRP [dBm]",
-    ]
+        "x", "y", "Serving PCI", "Serving RSRP [dBm]", "N1 PCI", "N1 RSRP [dBm]", "N2 PCI", "N2 RSRP [dBm]",
+    ]  # fmt: skip
     rows = [
         [*place[:2].round(2), *(v for c in cells for v in (c + 10, level[c].round(1)))]
         for place, cells, level in zip(one.moment, order, one.measured, strict=False)

@@ -1,8 +1,6 @@
 """Parts of a campaign: which rows and links stay, what is said of the others, which settings cannot be."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from measured import ble_arrays, techtile_arrays
@@ -81,10 +79,8 @@ def test_antenna_5_of_a_part_of_them_answered_as_1(make):
 
 def test_what_belongs_to_a_station_goes_with_it():
     more = {
-        "sensitivity_db": np.arange(4.0),
-        "carrier_hz": 1e9 + np.arange(4.0),
-        "mask": np.ones((15, 4), bool),
-    }
+        "sensitivity_db": np.arange(4.0), "carrier_hz": 1e9 + np.arange(4.0), "mask": np.ones((15, 4), bool),
+    }  # fmt: skip
     kept = keep_stations(Raw({**wide().arrays, **more}), [2, 0], "file").raw.arrays
     assert kept["sensitivity_db"].tolist() == [0, 2] and kept["carrier_hz"].tolist() == [1e9, 1e9 + 2]
     assert kept["mask"].shape == (15, 2)
@@ -165,11 +161,9 @@ def test_the_file_s_split_follows_its_rows():
 
 def test_paths_follow_their_rows():
     raw = plain(
-        4,
-        path_offsets=np.array([0, 2, 2, 5, 6]),
-        path_gain=np.arange(6.0),
+        4, path_offsets=np.array([0, 2, 2, 5, 6]), path_gain=np.arange(6.0),
         path_last_point=np.arange(18.0).reshape(6, 3),
-    )
+    )  # fmt: skip
     kept = take_rows(raw, np.array([0, 2]))
     assert kept["path_offsets"].tolist() == [0, 2, 5] and kept["path_gain"].tolist() == [0, 1, 2, 3, 4]
     assert kept["path_last_point"].shape == (5, 3)

@@ -141,19 +141,16 @@ def test_bad_index_files_are_refused(tmp_path):
             read_split(path, 400)
 
 
-@pytest.mark.parametrize(
-    "settings, pattern",
-    [
-        ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
-        ({"name": "groupd"}, "did you mean 'grouped'"),
-        ({"val_fraction": 1.0}, "val_fraction=1.0"),
-        ({"test_fraction": 0.0}, "test_fraction=0.0"),
-        ({"thin": 0.0}, "thin=0.0"),
-        ({"train_count": 0}, "train_count=0"),
-        ({"buffer_m": float("nan")}, "buffer_m=nan"),
-        ({"corner": "north"}, "corner='north'"),
-    ],
-)
+@pytest.mark.parametrize("settings, pattern", [
+    ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
+    ({"name": "groupd"}, "did you mean 'grouped'"),
+    ({"val_fraction": 1.0}, "val_fraction=1.0"),
+    ({"test_fraction": 0.0}, "test_fraction=0.0"),
+    ({"thin": 0.0}, "thin=0.0"),
+    ({"train_count": 0}, "train_count=0"),
+    ({"buffer_m": float("nan")}, "buffer_m=nan"),
+    ({"corner": "north"}, "corner='north'"),
+])  # fmt: skip
 def test_impossible_settings_are_refused(settings, pattern):
     with pytest.raises(DataError, match=pattern):
         SplitSettings(**settings)

@@ -1,7 +1,5 @@
 """Tables and arrays as strangers make them: each kind is read right, or named."""
 
-from __future__ import annotations
-
 from io import StringIO
 from pathlib import Path
 
@@ -73,51 +71,23 @@ CASES = {
     "a text": (wide("No Service"), {}, "394 of 720 levels are 'No Service': taken as not heard", "refused"),
     "no power": (wide("-inf"), {}, "394 of 720 powers were not heard", "refused"),
     "a mark that is none": (wide(100), {"not_heard": []}, "394 levels above 60 dBm", "taken as not heard"),
-    "no fix": (
-        table("lat,lon,rssi", *ZERO.T, LEVELS[:, 0]),
-        {},
-        "lines 2 to 13: latitude and longitude are 0",
-        "",
-    ),
+    "no fix": (table("lat,lon,rssi", *ZERO.T, LEVELS[:, 0]), {},
+        "lines 2 to 13: latitude and longitude are 0", ""),
     "minutes": (table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]), {}, "north of 48.20", "refused"),
     "NMEA": (table("lat,lon,rssi", *NMEA, LEVELS[:, 0]), {}, "as NMEA writes them (ddmm.mmmm)", "more rows"),
-    "ten millionths": (
-        table("lat,lon,rssi", *(np.c_[NORTH, EAST] * 1e7).astype(int).T, LEVELS[:, 0]),
-        {},
-        "times ten million",
-        "",
-    ),
-    "degrees in metres": (
-        table("LAT,LON,rssi", *(PLACES + np.array([5e6, 4e5])).T, LEVELS[:, 0]),
-        {},
-        "dataset.columns.x=LON dataset.columns.y=LAT",
-        "",
-    ),
-    "two zones": (
-        long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES),
-        {},
-        "two groups of places 399.9 km apart, as column 'grid' says",
-        "millimetres",
-    ),
-    "a stuck fix": (
-        long("t", range(ROWS), level=ALONG, places=STUCK),
-        {},
-        "line 63 to line 181: the place stands still",
-        "",
-    ),
+    "ten millionths": (table("lat,lon,rssi", *(np.c_[NORTH, EAST] * 1e7).astype(int).T, LEVELS[:, 0]), {},
+        "times ten million", ""),
+    "degrees in metres": (table("LAT,LON,rssi", *(PLACES + np.array([5e6, 4e5])).T, LEVELS[:, 0]), {},
+        "dataset.columns.x=LON dataset.columns.y=LAT", ""),
+    "two zones": (long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES), {},
+        "two groups of places 399.9 km apart, as column 'grid' says", "millimetres"),
+    "a stuck fix": (long("t", range(ROWS), level=ALONG, places=STUCK), {},
+        "line 63 to line 181: the place stands still", ""),
     "a list in feet": (THREE, {"stations_file": IN_FEET}, "far better if the stations are in feet", ""),
-    "floors": (
-        long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR),
-        {},
-        "dataset.columns.z=Storey*3.2",
-        "",
-    ),
-    "floors as metres": (
-        long("floor", FLOOR),
-        {"columns": {"z": "floor"}},
-        "floors as heights in metres?",
-        "",
-    ),
+    "floors": (long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR), {}, "dataset.columns.z=Storey*3.2",
+        ""),
+    "floors as metres": (long("floor", FLOOR), {"columns": {"z": "floor"}}, "floors as heights in metres?",
+        ""),
     "a floor of 3.2 m": (long("floor", FLOOR), {"columns": {"z": "floor*3.2"}}, "x 6.40 m", "warning"),
     "a flight in feet": (
         table(
@@ -127,49 +97,25 @@ CASES = {
         "feet turned into m",
         "",
     ),
-    "an area and a cell": (
-        long("cell_id,tac", 7 + 0 * BAND, BAND),
-        {},
-        "2 stations, 2 of them at unknown places: 7 1, 7 0",
-        "",
-    ),
+    "an area and a cell": (long("cell_id,tac", 7 + 0 * BAND, BAND), {},
+        "2 stations, 2 of them at unknown places: 7 1, 7 0", ""),
     "a confidence interval": (long("CI", 7 + BAND), {}, "stays       the transmitter", "stations"),
-    "columns that are said": (
-        long("site,antenna", 7 + 0 * BAND, BAND),
-        {"columns": {"station": "site+antenna"}},
-        "2 stations, 2 of",
-        "",
-    ),
-    "a column that splits": (
-        long("site,antenna", 7 + 0 * BAND, BAND, level=LEVELS[:, 0] - 12 * BAND),
-        {},
-        "dataset.columns.station=site+antenna tells them apart",
-        "",
-    ),
+    "columns that are said": (long("site,antenna", 7 + 0 * BAND, BAND),
+        {"columns": {"station": "site+antenna"}}, "2 stations, 2 of", ""),
+    "a column that splits": (long("site,antenna", 7 + 0 * BAND, BAND, level=LEVELS[:, 0] - 12 * BAND), {},
+        "dataset.columns.station=site+antenna tells them apart", ""),
     "two cells of one name": (
         long("site,layer", "a" * ROWS, FARTHER, level=np.where(FARTHER, LEVELS[:, 2], LEVELS[:, 1])),
         {},
         "another place for each value of column 'layer': dataset.columns.station=site+layer tells them apart",
         "",
     ),
-    "streets of one cell": (
-        long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])),
-        {},
-        "1 stations",
-        "warning",
-    ),
-    "hopping": (
-        long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)),
-        {},
-        "1 stations",
-        "warning",
-    ),
-    "a rounded name": (
-        long("gateway_eui", np.where(BAND == 1, "1.2E+15", "b")),
-        {},
-        "rounded by a spreadsheet",
-        "",
-    ),
+    "streets of one cell": (long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])), {},
+        "1 stations", "warning"),
+    "hopping": (long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)), {},
+        "1 stations", "warning"),
+    "a rounded name": (long("gateway_eui", np.where(BAND == 1, "1.2E+15", "b")), {},
+        "rounded by a spreadsheet", ""),
     "a banner with a role in it": (
         "WigleWifi-1.6,model=x,device=x,display=kismet\n"
         + table(
@@ -184,32 +130,16 @@ CASES = {
         "2.412 GHz",
         "refused",
     ),
-    "a quality": (
-        table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110),
-        {},
-        "'quality' is a quality, not a level",
-        "",
-    ),
+    "a quality": (table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110), {},
+        "'quality' is a quality, not a level", ""),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),
-    "units in cells": (
-        long("t", range(ROWS), level=[f"{v} dBm" for v in LEVELS[:, 0]]),
-        {},
-        "good",
-        "refused",
-    ),
-    "per cent in cells": (
-        long("t", range(ROWS), level=[f"{v + 110}%" for v in LEVELS[:, 0]]),
-        {},
-        "a quality, not a level",
-        "more rows",
-    ),
+    "units in cells": (long("t", range(ROWS), level=[f"{v} dBm" for v in LEVELS[:, 0]]), {}, "good",
+        "refused"),
+    "per cent in cells": (long("t", range(ROWS), level=[f"{v + 110}%" for v in LEVELS[:, 0]]), {},
+        "a quality, not a level", "more rows"),
     "losses": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]), {}, "rssi_db=path_loss*-1 takes losses", ""),
-    "losses that are said": (
-        table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),
-        {"columns": {"rssi_db": "path_loss*-1"}},
-        "good",
-        "warning",
-    ),
+    "losses that are said": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),
+        {"columns": {"rssi_db": "path_loss*-1"}}, "good", "warning"),
     "many of a kind": (
         "\n".join(
             [
@@ -224,7 +154,7 @@ CASES = {
         "(and 29 more warnings of this kind)",
         "station AP7",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -326,18 +256,12 @@ def test_amplitudes_and_phases_are_channels(write, unit):
 
 
 STRANGERS = {
-    "c02_half_null.csv": "lines 2 to 208:",
-    "c03_minus.csv": "3 stations",
-    "c03_survey.csv": "3 stations",
-    "c06_pci.csv": "3 stations",
-    "c06_dms.csv": "3 stations",
-    "c06_nmea.csv": "NMEA",
-    "c07_uji.csv": "dataset.columns.x=LONGITUDE",
-    "c08_gw_null.csv": "ttn-roof-3: no fix",
-    "c11_us915.csv": "1 stations",
-    "silent_100.csv": "514 of 720 levels are exactly 100",
+    "c02_half_null.csv": "lines 2 to 208:", "c03_minus.csv": "3 stations", "c03_survey.csv": "3 stations",
+    "c06_pci.csv": "3 stations", "c06_dms.csv": "3 stations", "c06_nmea.csv": "NMEA",
+    "c07_uji.csv": "dataset.columns.x=LONGITUDE", "c08_gw_null.csv": "ttn-roof-3: no fix",
+    "c11_us915.csv": "1 stations", "silent_100.csv": "514 of 720 levels are exactly 100",
     "c10_ampphase.csv": "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STRANGERS)

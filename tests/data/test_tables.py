@@ -154,15 +154,12 @@ def test_long_layout_with_a_second_file(write, caplog):
     assert "listed, but in no row: 5" in table.notes
 
 
-@pytest.mark.parametrize(
-    "heads, columns",
-    [
-        ("rssi_b,rssi_a", {}),
-        ("b,a", {}),
-        ("level of b (s),level of a (s)", {"rssi_db": "level of * (s)"}),
-        ("b dBm,a dBm", {"rssi_db": "* dBm"}),
-    ],
-)
+@pytest.mark.parametrize("heads, columns", [
+    ("rssi_b,rssi_a", {}),
+    ("b,a", {}),
+    ("level of b (s),level of a (s)", {"rssi_db": "level of * (s)"}),
+    ("b dBm,a dBm", {"rssi_db": "* dBm"}),
+])  # fmt: skip
 def test_wide_layout(write, heads, columns):
     text = f"x,y,z,{heads}\n1,2,3,-80,-90\n4,5,6,,-91\n"
     arrays = understand_table(write(text), columns, write(STATIONS, "stations.csv")).raw.arrays
@@ -310,17 +307,14 @@ def test_all_bad_cells_are_listed_at_once(write, refused):
     assert "the same in 15 more rows" in said and "the same in 5 more rows" in said
 
 
-@pytest.mark.parametrize(
-    "listed, words",
-    [
-        ("name,x,y,z\na,1,2,3\n", "column 'station', line 3: 'b' is no listed station"),
-        ("name,x,y,z\na,1,2,3\nB1,1,2,3\nb7,3,4,5\n", "did you mean 'b7'?"),
-        ("name,x,y,z\na,1,2,3\na,1,2,4\n", "station 'a' is listed twice, in line 2 and line 3"),
-        ("x,y,z\n1,2,3\n", "no column of names"),
-        ("name,height\na,1\n", "no coordinates; expected columns x, y, z"),
-        ("name,x,y\na,1,\n", "column 'y', line 2: no value; station_y is needed"),
-    ],
-)
+@pytest.mark.parametrize("listed, words", [
+    ("name,x,y,z\na,1,2,3\n", "column 'station', line 3: 'b' is no listed station"),
+    ("name,x,y,z\na,1,2,3\nB1,1,2,3\nb7,3,4,5\n", "did you mean 'b7'?"),
+    ("name,x,y,z\na,1,2,3\na,1,2,4\n", "station 'a' is listed twice, in line 2 and line 3"),
+    ("x,y,z\n1,2,3\n", "no column of names"),
+    ("name,height\na,1\n", "no coordinates; expected columns x, y, z"),
+    ("name,x,y\na,1,\n", "column 'y', line 2: no value; station_y is needed"),
+])  # fmt: skip
 def test_a_spoilt_list_of_stations(write, refused, listed, words):
     rows = write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n")
     refused(words, understand_table, rows, {}, write(listed, "stations.csv"))

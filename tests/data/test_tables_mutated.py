@@ -56,10 +56,8 @@ class Drive:
         heads = self.separator.join(self.cell(head.replace(" ", gap)) for head in self.columns)
         rows = zip(*self.columns.values(), strict=True)
         return [
-            *self.above,
-            self.comment + heads,
-            *(self.separator.join(map(self.cell, row)) for row in rows),
-        ]
+            *self.above, self.comment + heads, *(self.separator.join(map(self.cell, row)) for row in rows),
+        ]  # fmt: skip
 
     def renamed(self, names: dict[str, str]) -> Drive:
         return replace(self, columns={names.get(head, head): values for head, values in self.columns.items()})
@@ -264,13 +262,9 @@ class Changes:
 
     def a_column_more(drive, rng):
         more = {
-            "battery_level": 3.5,
-            "rssi_delta": 1.0,
-            "SINR": 12.0,
-            "tx_power_dbm": 30.0,
-            "time": "12:30:05",
+            "battery_level": 3.5, "rssi_delta": 1.0, "SINR": 12.0, "tx_power_dbm": 30.0, "time": "12:30:05",
             "": 4.0,
-        }
+        }  # fmt: skip
         head = str(rng.choice(list(more)))
         return replace(drive, columns={**drive.columns, head: [more[head]] * COUNT}), EITHER
 

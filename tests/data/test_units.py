@@ -1,7 +1,5 @@
 """Powers as they are stored and in every unit that people give them in."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

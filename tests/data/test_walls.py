@@ -1,7 +1,5 @@
 """Walls out of files: simulated rooms, lists of corners, meshes, and what cannot be."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Errors in one line, and the log as the console shows it."""
 
-from __future__ import annotations
-
 import io
 import logging
 from logging.config import dictConfig

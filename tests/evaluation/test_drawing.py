@@ -1,7 +1,5 @@
 """Methods are told apart in every figure, with any colour vision."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The harness: pooling, pairing, skill, time beside every accuracy."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

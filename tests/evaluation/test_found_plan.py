@@ -1,7 +1,5 @@
 """The map of what a field found: everything on it is named, and stands where it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.figure import Figure

@@ -1,7 +1,5 @@
 """Intervals and outages of predicted normal distributions, against draws from them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures of merit against their definitions and against hard cases."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Data of another file in the coordinates, units and stations of a model."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -160,8 +158,10 @@ def test_what_is_in_target_units_is_converted_with_the_target(room):
 def test_locate_built_whatever_class_a_checkpoint_named():
     """Settings that the stored class does not follow were instantiated, `os.system` as well."""
     settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "budget_s": 2.0}
-    run = Opened([], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, None)
-    make, context = run.retraining(budget_s=5.0)
+    split = SimpleNamespace(folds=[None])
+    run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, split)
+    learned = run.retraining(budget_s=5.0)
+    make, context = learned.make, learned.context
     assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
     with pytest.raises(ValueError, match=r"os\.system.*refused"):
         make()

@@ -1,7 +1,5 @@
 """Every kind of target leaves a picture of its test rows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from PIL import Image

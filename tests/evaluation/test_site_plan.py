@@ -1,7 +1,5 @@
 """The map of a campaign: what is on it, and that it is drawn for every kind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -16,11 +14,9 @@ from gsparc.evaluation import site_plan
 from gsparc.evaluation.site_plan import draw_site, spots
 
 REAL = {
-    "techtile": "techtile-csi-920mhz",
-    "powder": "powder-rss-462mhz",
-    "ble": "ble-hall-1",
+    "techtile": "techtile-csi-920mhz", "powder": "powder-rss-462mhz", "ble": "ble-hall-1",
     "own": "techtile-power-reci-rf-1",
-}
+}  # fmt: skip
 
 
 def scattered(count=80):
@@ -103,11 +99,8 @@ def test_stations_that_jump_have_a_panel(figures):
     figure, said = shown(data, figures)
     panels = [axis for axis in figure.axes if axis.get_title()]
     assert [axis.get_title() for axis in panels] == ["b: steps that the places do not explain"]
-    assert (
-        "dB from row 119 to row 120" in said
-        and "its level jumps" in said
-        and "3 stations (receivers)" in said
-    )
+    assert "dB from row 119 to row 120" in said and "its level jumps" in said
+    assert "3 stations (receivers)" in said
 
 
 def test_the_origin_of_degrees_is_said(figures):
@@ -122,10 +115,8 @@ def test_the_origin_of_degrees_is_said(figures):
 
 def test_many_stations_are_counted_and_not_named(figures):
     arrays = {
-        "rx_position": scattered(),
-        "station_position": scattered(16),
-        "rssi_db": np.full((80, 16), -50.0),
-    }
+        "rx_position": scattered(), "station_position": scattered(16), "rssi_db": np.full((80, 16), -50.0),
+    }  # fmt: skip
     arrays["station_name"] = np.array([f"post{i}" for i in range(16)])
     said = shown(from_arrays(arrays), figures)[1]
     assert "16 stations" in said and "post3" not in said

@@ -1,7 +1,5 @@
 """What a run leaves behind."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -55,16 +53,10 @@ def test_samples_become_rows(tmp_path):
 
 def test_table_shows_no_accuracy_without_its_time():
     facts = {
-        "dataset/kind": "spectrum",
-        "test/ssim": 0.91234,
-        "test/psnr_db": 30.0,
-        "time/train_s": 123.0,
-        "time/render_ms_p50": 1.25,
-        "baseline/gp/ssim": 0.9,
-        "baseline/gp/train_s": 0.5,
-        "baseline/gp/render_ms_p50": 2.5,
-        "baseline/zero/ssim": 0.001,
-    }
+        "dataset/kind": "spectrum", "test/ssim": 0.91234, "test/psnr_db": 30.0, "time/train_s": 123.0,
+        "time/render_ms_p50": 1.25, "baseline/gp/ssim": 0.9, "baseline/gp/train_s": 0.5,
+        "baseline/gp/render_ms_p50": 2.5, "baseline/zero/ssim": 0.001,
+    }  # fmt: skip
     console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(results_table(facts, "gsparc", "toy"))
     lines = [line for line in console.export_text().splitlines() if "│" in line]

@@ -1,7 +1,5 @@
 """Methods and datasets of other packages: found, trained, stored, compared; a broken one disturbs nobody."""
 
-from __future__ import annotations
-
 import importlib
 import tomllib
 from pathlib import Path
@@ -54,13 +52,9 @@ def installed(tmp_path, monkeypatch):
 def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     installed(EXAMPLES / "own-method")
     config = compose(
-        "dataset=corridor",
-        "dataset.count=60",
-        "model=nearest_k",
-        "model.k=2",
-        "baselines=[mean]",
+        "dataset=corridor", "dataset.count=60", "model=nearest_k", "model.k=2", "baselines=[mean]",
         "logger=none",
-    )
+    )  # fmt: skip
     facts, objects = train(config, tmp_path)
     assert facts["model/name"] == "nearest_k" and objects.methods[0].k == 2
     assert facts["test/rmse_db"] < facts["baseline/mean/rmse_db"]
@@ -116,13 +110,9 @@ def test_a_third_party_library_as_a_plugin(installed, tmp_path):
     installed(EXAMPLES / "gpytorch-method")
     file = spectra(tmp_path / "own.npz")
     config = compose(
-        "dataset=own",
-        f"dataset.file={file}",
-        "model=gpytorch",
-        "model.steps=5",
-        "baselines=[mean]",
+        "dataset=own", f"dataset.file={file}", "model=gpytorch", "model.steps=5", "baselines=[mean]",
         "logger=none",
-    )
+    )  # fmt: skip
     facts, objects = train(config, tmp_path)
     assert facts["test/mse"] < facts["baseline/mean/mse"]
     place = objects.data.moving[0] + objects.data.site.origin

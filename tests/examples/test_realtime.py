@@ -1,7 +1,5 @@
 """The loop of 1,000 places a second counts what it misses."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import time

@@ -27,9 +27,8 @@ def test_warmup_rises_to_the_full_rate():
 
 
 def test_every_parameter_has_its_rate():
-    assert (
-        kind_of("gaussians.means") == "positions" and kind_of("confidence.network.0.weight") == "confidence"
-    )
+    assert kind_of("gaussians.means") == "positions"
+    assert kind_of("confidence.network.0.weight") == "confidence"
     with pytest.raises(KeyError, match=r"gsparc\.field\.optimizer\.KINDS"):
         kind_of("gaussians.means_too")
 

@@ -21,15 +21,10 @@ LEVELS_DB = 1.5  # noise of powers [dB]
 SPECKLE = 0.02  # noise of spectra
 
 CHOICES = {
-    "kind": ("array", "moving_array", "image", "tone", "tones", "antennas", "power"),
-    "runs": (1, 5),
-    "stations": (1, 4),
-    "moving": ("rx", "tx", "both"),
-    "frame": ("metres", "utm", "degrees"),
-    "missing": ("none", "silent", "masked"),
-    "split": ("random", "blocks", "runs"),
-    "rows": (30, 300, 3000),
-}
+    "kind": ("array", "moving_array", "image", "tone", "tones", "antennas", "power"), "runs": (1, 5),
+    "stations": (1, 4), "moving": ("rx", "tx", "both"), "frame": ("metres", "utm", "degrees"),
+    "missing": ("none", "silent", "masked"), "split": ("random", "blocks", "runs"), "rows": (30, 300, 3000),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -86,5 +86,5 @@ def test_hardly_any_noise_does_not_end_a_short_fit(tmp_path):
         "frequency_hz": arrays["frequency_hz"][::13],
     }  # fmt: skip
     field = gsparc("init.searches=1", "init.search_rows=120")
-    (found,) = figures(from_arrays(arrays, {"name": "band"}), tmp_path, (field, 3.0))
+    (found,) = figures(from_arrays(arrays, {"name": "band"}), tmp_path, (field, 1.5))
     assert np.isfinite(found["nmse"]) and found["nmse"] < 1.1

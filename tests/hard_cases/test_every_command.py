@@ -20,20 +20,13 @@ from gsparc.__main__ import main
 LINES = {
     "a rendered field": "train dataset=rfid model=gsparc model.effects.array=false",
     "an array's field": "train dataset=rfid model=gsparc",
-    "sources": "train dataset=newrf model=gsparc init=sources",
-    "powers": "train dataset=own model=gsparc",
-    "stations": "train dataset=ble model=gp",
-    "study": "study kind=effects dataset=newrf",
-    "compare": "compare datasets.rfid.root=DIR",
-    "evaluate": "evaluate ckpt=FILE",
-    "predict": "predict ckpt=FILE places=FILE",
-    "map": "map ckpt=FILE",
-    "plan": "plan ckpt=FILE",
-    "place": "place ckpt=FILE",
-    "view": "view ckpt=FILE save=page.html",
-    "tradeoff": "tradeoff ckpt=FILE",
+    "sources": "train dataset=newrf model=gsparc init=sources", "powers": "train dataset=own model=gsparc",
+    "stations": "train dataset=ble model=gp", "study": "study kind=effects dataset=newrf",
+    "compare": "compare datasets.rfid.root=DIR", "evaluate": "evaluate ckpt=FILE",
+    "predict": "predict ckpt=FILE places=FILE", "map": "map ckpt=FILE", "plan": "plan ckpt=FILE",
+    "place": "place ckpt=FILE", "view": "view ckpt=FILE save=page.html", "tradeoff": "tradeoff ckpt=FILE",
     "calibrate": "calibrate ckpt=FILE",
-}
+}  # fmt: skip
 SIZES = (0, 300, 6_000, 60_000)  # bytes: nothing, Hydra's notes, tables, pictures and models
 
 

@@ -21,12 +21,10 @@ def wall(opacity: float, n: int = 30_000) -> Scene:
     means = torch.cat([torch.linspace(2, 8, n)[:, None], 0.3 * torch.randn(n, 2, generator=draw)], 1)
     means[0] = torch.tensor([1.5, 0.0, 1.5 * math.tan(0.1)])  # nearest, at a pixel's centre: it is clamped
     return Scene(
-        means=means.double(),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1),
-        scales=torch.full((n, 3), 0.5).double(),
-        opacities=torch.full((n,), opacity).float().double(),
+        means=means.double(), quats=torch.tensor([[1.0, 0, 0, 0]]).double().repeat(n, 1),
+        scales=torch.full((n, 3), 0.5).double(), opacities=torch.full((n,), opacity).float().double(),
         features=torch.randn(1, n, 1, generator=draw).double(),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("opacity", [1.0, 0.985, 0.01])

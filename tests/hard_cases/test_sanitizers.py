@@ -58,12 +58,10 @@ def library(name: str) -> str:
 def watched(module: Path, isa: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """pytest on the sanitized module; leaks are Python's own, so they are not looked for."""
     environment = {
-        **os.environ,
-        "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so')}",
+        **os.environ, "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so')}",
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:detect_odr_violation=0",
-        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
-        "OMP_NUM_THREADS": "2",
-    }
+        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1", "OMP_NUM_THREADS": "2",
+    }  # fmt: skip
     given = [str(module), isa, "-q", "-s", "-p", "no:cacheprovider", *arguments]
     command = [sys.executable, "tests/helpers/sanitized.py", *given]
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)

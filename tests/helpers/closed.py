@@ -1,7 +1,5 @@
 """Closed forms fitted to rows, and read back, for tests."""
 
-from __future__ import annotations
-
 import io
 from typing import TypeVar
 
@@ -10,6 +8,8 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.closed_form import ClosedForm, restored, stored
 from gsparc.training.context import FitContext
 
@@ -22,6 +22,14 @@ def fitted_to(
     """The method fitted to rows (n,), and its notes."""
     context = FitContext(budget_s=budget_s)
     return method, method.fit(data, Fold(rows, rows[:0], rows[:0]), context).notes
+
+
+def conditioned(prior: ChannelPrior, data: Measurements, rows: np.ndarray) -> ChannelField:
+    """Waves of known terms, given rows (n,)."""
+    field = ChannelField()
+    field.site, field.prior, field.channel = data.site, prior, tuple(data.target.shape[1:])
+    field.condition(data, rows)
+    return field
 
 
 def read_back(method: Form) -> Form:

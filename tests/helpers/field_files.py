@@ -1,7 +1,5 @@
 """Files of exported fields with several fields changed together, their checksums made right."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 
@@ -11,34 +9,12 @@ from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, packe
 
 COMMON = 6  # numbers before those of the form
 SIZES = {
-    1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13),
-    2: (0, 1, 2, 7, 8, 9),
-    3: (0, 1, 2, 3, 4, 5),
-    4: (0, 1, 2, 3, 4),
-}
+    1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13), 2: (0, 1, 2, 7, 8, 9), 3: (0, 1, 2, 3, 4, 5), 4: (0, 1, 2, 3, 4),
+}  # fmt: skip
 WHOLE = [
-    0,
-    1,
-    2,
-    3,
-    4,
-    6,
-    7,
-    8,
-    15,
-    16,
-    17,
-    31,
-    64,
-    255,
-    1024,
-    4095,
-    4096,
-    46341,
-    65535,
-    65536,
+    0, 1, 2, 3, 4, 6, 7, 8, 15, 16, 17, 31, 64, 255, 1024, 4095, 4096, 46341, 65535, 65536,
     *2 ** np.arange(17, 27),
-]
+]  # fmt: skip
 ODD = [np.nan, np.inf, -np.inf, -1, 0, 0.5, 1e-300, 1e300, -1e9, 2.0**31, 2.0**53, 2.0**63]
 MOST = 1 << 22  # numbers of an array that is made longer
 

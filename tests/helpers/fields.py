@@ -31,21 +31,12 @@ GRIDS = st.sampled_from(
 )
 CIRCLES = GRIDS.filter(lambda grid: grid.periodic)
 DIRECTIONS = {
-    "anywhere": None,
-    "seam": (-1.0, 1e-7, 0.3),
-    "zenith": (0.0, 0.0, 1.0),
-    "near zenith": (1e-6, -1e-6, 1.0),
-    "nadir": (0.0, 0.0, -1.0),
-    "horizon": (0.6, 0.8, 0.0),
-    "below": (0.5, -0.5, -0.4),
-}
+    "anywhere": None, "seam": (-1.0, 1e-7, 0.3), "zenith": (0.0, 0.0, 1.0), "near zenith": (1e-6, -1e-6, 1.0),
+    "nadir": (0.0, 0.0, -1.0), "horizon": (0.6, 0.8, 0.0), "below": (0.5, -0.5, -0.4),
+}  # fmt: skip
 QUATERNIONS = {
-    "any": None,
-    "none": (0.0, 0.0, 0.0, 0.0),
-    "long": 1e9,
-    "short": 1e-9,
-    "identity": (1.0, 0, 0, 0),
-}
+    "any": None, "none": (0.0, 0.0, 0.0, 0.0), "long": 1e9, "short": 1e-9, "identity": (1.0, 0, 0, 0),
+}  # fmt: skip
 OPACITIES = (1 - 1e-7, 1.0, 0.99, 0.985, 0.7, 0.1, 0.004, 1e-7, 1e-30, 0.0)
 ASPECTS = (1.0, 1e-1, 1e-2, 1e-4, 1e-6)
 
@@ -113,15 +104,12 @@ def fields(draw, hides: bool | None = None, grids: st.SearchStrategy = GRIDS) ->
         torch.zeros(3).double() if draw(st.booleans()) else torch.randn(3, generator=noise).double() * 0.02
     )
     return Drawn(
-        scene,
-        Pose(place.float().double(), rotation),
-        draw(grids),
-        draw(st.sampled_from(["tangent", "equirect"])),
-        draw(st.sampled_from([0.3, 0.3, 0.01, 0.0])),
+        scene, Pose(place.float().double(), rotation), draw(grids),
+        draw(st.sampled_from(["tangent", "equirect"])), draw(st.sampled_from([0.3, 0.3, 0.01, 0.0])),
         draw(st.booleans()),
         draw(st.sampled_from([Cutoff(), Cutoff(1e-3, 1e-4, relative=True), Cutoff(1e-6, 0.0)])),
         draw(st.sampled_from([torch.float32, torch.float64])),
-    )
+    )  # fmt: skip
 
 
 def show(drawn: Drawn, backend: str, **more) -> Outcome:

@@ -4,8 +4,6 @@ Half-sent heads and bodies, a byte now and then, nonsense, malformed bodies, ans
 nobody reads or whose clients die, and more connections than are allowed. Exit status 0 when the time is over.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

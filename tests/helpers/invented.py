@@ -23,29 +23,16 @@ def invent(kind: str = "spectrum", rows: int = 48, static_end: str = "rx", seed:
         target = (1e-6 * 10 ** np.sin(phase)).astype(np.float32)
     ends = (moving, still) if static_end == "rx" else (still, moving)
     site = Site(
-        name="toy",
-        kind=kind,
-        static_end=static_end,
-        grid=SphereGrid.hemisphere(12, 24) if kind == "spectrum" else None,
-        array=None,
-        carrier_hz=1e9,
-        subcarriers_hz=None,
-        origin=np.array([100.0, -50.0, 3.0]),
-        box=np.array([[-0.5] * 3, [0.5] * 3]),
-        moving_box=np.array([[-0.5] * 3, [0.5] * 3]),
-        sha256=f"{kind}-{rows}-{static_end}-{seed}",
-        target_scale=2.0 if kind == "csi" else 1.0,
-        static_position=still[0],
-        rx_rotation=np.eye(3),
-    )
+        name="toy", kind=kind, static_end=static_end,
+        grid=SphereGrid.hemisphere(12, 24) if kind == "spectrum" else None, array=None, carrier_hz=1e9,
+        subcarriers_hz=None, origin=np.array([100.0, -50.0, 3.0]), box=np.array([[-0.5] * 3, [0.5] * 3]),
+        moving_box=np.array([[-0.5] * 3, [0.5] * 3]), sha256=f"{kind}-{rows}-{static_end}-{seed}",
+        target_scale=2.0 if kind == "csi" else 1.0, static_position=still[0], rx_rotation=np.eye(3),
+    )  # fmt: skip
     return Measurements(
-        site=site,
-        tx=ends[0],
-        rx_position=ends[1],
-        rx_rotation=np.tile(np.eye(3), (rows, 1, 1)),
-        target=target.reshape(rows, *shape),
-        row_names=[f"row {i}" for i in range(rows)],
-    )
+        site=site, tx=ends[0], rx_position=ends[1], rx_rotation=np.tile(np.eye(3), (rows, 1, 1)),
+        target=target.reshape(rows, *shape), row_names=[f"row {i}" for i in range(rows)],
+    )  # fmt: skip
 
 
 def divide(rows: int, folds: int = 1) -> Split:

@@ -66,12 +66,7 @@ def several(folder: Path) -> Measurements:
 
 
 KINDS: dict[str, Callable[[Path], Measurements]] = {
-    "images": images,
-    "static array": static_array,
-    "moving array": moving_array,
-    "channels": gains,
-    "channels of an array": bands,
-    "channels from nowhere known": unplaced,
-    "powers": received,
+    "images": images, "static array": static_array, "moving array": moving_array, "channels": gains,
+    "channels of an array": bands, "channels from nowhere known": unplaced, "powers": received,
     "powers of several stations": several,
-}
+}  # fmt: skip

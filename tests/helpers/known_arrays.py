@@ -42,13 +42,11 @@ def measure(
     image = image / image.max((1, 2), keepdims=True)
     rows = len(tx)
     return Measurements(
-        site=replace(site, sha256=sha256),
-        tx=tx,
-        rx_position=np.tile(RECEIVER, (rows, 1)),
+        site=replace(site, sha256=sha256), tx=tx, rx_position=np.tile(RECEIVER, (rows, 1)),
         rx_rotation=np.tile(TURN, (rows, 1, 1)),
         target=np.round(255 * image).astype(np.uint8) if bits else image.astype(np.float32),
         row_names=[f"row {i}" for i in range(rows)],
-    )
+    )  # fmt: skip
 
 
 def walk(rows: int, seed: int = 0, step: float = 0.012) -> np.ndarray:

@@ -26,13 +26,10 @@ def techtile_arrays() -> dict[str, np.ndarray]:
     mask = np.ones((12, 3), bool)
     mask[4, 1] = False
     return {
-        "tx_position": places,
-        "rx_antenna_position": ANTENNAS,
-        "csi": np.where(mask, channels_of(places), 0).astype(np.complex64),
-        "mask": mask,
-        "run": np.repeat(RUNS, [8, 4]),
-        "frequency_hz": np.array(920e6),
-    }
+        "tx_position": places, "rx_antenna_position": ANTENNAS,
+        "csi": np.where(mask, channels_of(places), 0).astype(np.complex64), "mask": mask,
+        "run": np.repeat(RUNS, [8, 4]), "frequency_hz": np.array(920e6),
+    }  # fmt: skip
 
 
 def release_variables() -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
@@ -46,15 +43,12 @@ def release_variables() -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
     heard[0, 3, 2], stored[0, 3, 2] = 0, np.nan
     over = ("experiment_id", "cycle_id")
     return {
-        "experiment_id": (over[:1], RUNS),
-        "cycle_id": (over[1:], np.arange(1, CYCLES + 1, dtype=np.int32)),
+        "experiment_id": (over[:1], RUNS), "cycle_id": (over[1:], np.arange(1, CYCLES + 1, dtype=np.int32)),
         "hostname": (("hostname",), HOSTS),
         **{f"rover_{axis}": (over, where[..., i]) for i, axis in enumerate("xyz")},
-        "position_available": (over, placed),
-        "csi_real": ((*over, "hostname"), stored.real.copy()),
-        "csi_imag": ((*over, "hostname"), stored.imag.copy()),
-        "csi_available": ((*over, "hostname"), heard),
-    }
+        "position_available": (over, placed), "csi_real": ((*over, "hostname"), stored.real.copy()),
+        "csi_imag": ((*over, "hostname"), stored.imag.copy()), "csi_available": ((*over, "hostname"), heard),
+    }  # fmt: skip
 
 
 def write_release(folder: Path, kind: str = "netcdf3", variables=None, antennas: bool = True) -> Path:
@@ -113,14 +107,9 @@ def powder_arrays() -> dict[str, np.ndarray]:
     rssi = (-20 - 25 * np.log10(distance)).astype(np.float32)
     rssi[[3, 7], [0, 2]] = np.nan
     return {
-        "mobile_position": metres_of(walk),
-        "station_position": metres_of(DEGREES),
-        "station": STATIONS,
-        "rssi_db": rssi,
-        "latitude": walk[:, 0],
-        "longitude": walk[:, 1],
-        "frequency_hz": np.array(462.7e6),
-    }
+        "mobile_position": metres_of(walk), "station_position": metres_of(DEGREES), "station": STATIONS,
+        "rssi_db": rssi, "latitude": walk[:, 0], "longitude": walk[:, 1], "frequency_hz": np.array(462.7e6),
+    }  # fmt: skip
 
 
 TABLE = (
@@ -150,12 +139,10 @@ def ble_arrays() -> dict[str, np.ndarray]:
     sensors = np.array([[7, 7, 1.2], [7, 0.7, 2.3], [13, 12, 1.2], [18, 12, 2.3]])
     distance = np.linalg.norm(places[:, None] - sensors, axis=-1)
     return {
-        "mobile_position": places,
-        "station_position": sensors,
+        "mobile_position": places, "station_position": sensors,
         "station": np.array(["sensor10", "sensor11", "sensor40", "sensor42"]),
-        "rssi_db": (-50 - 20 * np.log10(distance)).astype(np.float32),
-        "frequency_hz": np.array(2.44e9),
-    }
+        "rssi_db": (-50 - 20 * np.log10(distance)).astype(np.float32), "frequency_hz": np.array(2.44e9),
+    }  # fmt: skip
 
 
 MAKERS = {"techtile": techtile_arrays, "powder": powder_arrays, "ble": ble_arrays}

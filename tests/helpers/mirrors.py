@@ -1,7 +1,5 @@
 """A local server that stands for GitHub's raw files, and misbehaves as a test asks."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Channels as Wi-Fi cards log them: measured ones of a robot's runs, each row with factors of its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +23,9 @@ def robot(
     runs = np.unique(released["run"][good])[first : first + RUNS]
     good &= np.isin(released["run"], runs)
     given = {
-        "rx_position": released["rx_position"][good],
-        "tx_position": released["tx_position"][transmitter],
-        "frequency_hz": released["subcarrier_hz"],
-        "run": released["run"][good],
-    }
+        "rx_position": released["rx_position"][good], "tx_position": released["tx_position"][transmitter],
+        "frequency_hz": released["subcarrier_hz"], "run": released["run"][good],
+    }  # fmt: skip
     return given, channel[good]
 
 

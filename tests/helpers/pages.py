@@ -203,13 +203,9 @@ class Tiny:
 # Commands about a model.
 ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate", "export")
 ALIKE = {
-    "city": "powder",
-    "exp005": "techtile",
-    "exp006": "techtile",
-    "plane": "own",
-    "hall_1": "ble",
+    "city": "powder", "exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble",
     "hall_2": "ble",
-}
+}  # fmt: skip
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short

@@ -1,7 +1,5 @@
 """Powers at stations above a square of 20 m, by free space and a constant of each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

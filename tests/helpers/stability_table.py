@@ -15,12 +15,8 @@ BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 ENGINES = ["reference", "cpu", "cuda shim", "cuda"]
 KEYS = ["case", "backend", "precision"]
 FORMATS = {
-    "forward": "{:.1e}",
-    "backward": "{:.1e}",
-    "of allowed": "{:.0%}",
-    "ms": "{:.2f}",
-    "x truth": "{:.2f}",
-}
+    "forward": "{:.1e}", "backward": "{:.1e}", "of allowed": "{:.0%}", "ms": "{:.2f}", "x truth": "{:.2f}",
+}  # fmt: skip
 
 
 def write(path: Path, ledger: Ledger, folder: Path) -> None:

@@ -115,13 +115,9 @@ def drawn(number: int) -> Field:
     return Field(
         *(means, quats, scales, opacities),
         extinctions=opacities if rng.random() < 0.5 else rng.choice([0.0, 0.3, 1.0], count),
-        features=rng.normal(size=(samples, count, int(rng.integers(1, 6)))),
-        ids=rng.permutation(count),
-        positions=place,
-        rotations=turn,
-        grid=grid,
-        optics=optics,
-    )
+        features=rng.normal(size=(samples, count, int(rng.integers(1, 6)))), ids=rng.permutation(count),
+        positions=place, rotations=turn, grid=grid, optics=optics,
+    )  # fmt: skip
 
 
 @cache

@@ -1,7 +1,5 @@
 """`h = A z`, `|A^H h|`, its lags and the normalisation, against sums written out and the simulator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

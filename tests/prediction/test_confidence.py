@@ -1,7 +1,5 @@
 """A confidence kept with a model, and what `gsparc.load` answers with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`gsparc.fit`: three lines do what a file and a command do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from campaigns import brief, compose

@@ -1,7 +1,5 @@
 """Gradients of predictions by position: right, in both modes, in the caller's precision, or refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -155,13 +153,9 @@ CASES = {
     "gsparc, powers of stations": Case(planned(), kinds.several, "0"),
 }
 REFUSED = {
-    "nearest": "change in jumps",
-    "idw": "change in jumps",
-    "mean": "same everywhere",
-    "zero": "same everywhere",
-    "kriging": "outside of autograd",
-    "gsparc": "footprints",
-}
+    "nearest": "change in jumps", "idw": "change in jumps", "mean": "same everywhere",
+    "zero": "same everywhere", "kriging": "outside of autograd", "gsparc": "footprints",
+}  # fmt: skip
 QUICK = ("gp, spectra", "complex_gp, both ends", "gp, powers, nearest rows", "gsparc, powers of stations")
 
 
@@ -315,11 +309,9 @@ def are_finite_at_rows_and_at_one_place(predictor, data):
 
 
 PROPERTIES = (
-    equal_differences,
-    are_the_same_in_forward_mode_and_transforms,
-    leave_answers_as_they_are,
+    equal_differences, are_the_same_in_forward_mode_and_transforms, leave_answers_as_they_are,
     are_finite_at_rows_and_at_one_place,
-)
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)

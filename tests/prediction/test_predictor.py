@@ -1,7 +1,5 @@
 """gsparc.load: world coordinates in, the same kind of array out."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The clock: turns, warm-up, budget, machine facts."""
 
-from __future__ import annotations
-
 import torch
 from clocks import WoundClock
 

@@ -5,13 +5,8 @@ import torch
 from networks import pattern
 from scipy.spatial.distance import cdist
 
-from gsparc.processes.sectors import BEARING, OWN_SPREAD, SHARED_SPREAD, SectorKernel, Sectors
+from gsparc.processes.sectors import BEARING, LEVEL_DB, OWN_SPREAD, SHARED_SPREAD, SectorKernel, Sectors
 from gsparc.processes.trend import Law
-
-
-def matern(far: np.ndarray, length: float) -> np.ndarray:
-    scaled = np.sqrt(3) * far / length
-    return (1 + scaled) * np.exp(-scaled)
 
 
 def test_rows_of_one_sector_share_shadowing_of_their_own_and_a_bearing():
@@ -21,10 +16,10 @@ def test_rows_of_one_sector_share_shadowing_of_their_own_and_a_bearing():
     towards = places[:, :2] - places[:, 3:5]
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     far, alike = cdist(places[:, :3], places[:, :3]), np.exp((towards @ towards.T - 1) / BEARING**2)
-    own = 0.3 * matern(far, 20.0) + 0.2 * alike
-    wanted = 0.5 * matern(far, 80.0) + (number == number.T) * own
+    own = 0.2 * np.exp(-far / 20.0) + 0.2 * alike + 0.1
+    wanted = 0.5 * np.exp(-far / 80.0) + (number == number.T) * own
     at = torch.from_numpy(places)
-    found = SectorKernel((80.0, 20.0), (0.5, 0.3, 0.2), 0.1, 9.0).between(at, at)
+    found = SectorKernel((80.0, 20.0), (0.5, 0.2, 0.2, 0.1), 0.1, 9.0).between(at, at)
     np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
@@ -33,9 +28,9 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
     table = np.array([[90.0, 5, 65, 10, 2], [210.0, 3, 70, 9, 0]])
     shared, bend = [3.2, 1.5, 0.1, -0.05, 25.0, 0.5], 1.5
     trend = Sectors(
-        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=torch.from_numpy(table), rank=torch.arange(2),
-        band=torch.arange(2), shared=torch.tensor(shared).double(), doubt=torch.eye(8).double(),
-        levels=torch.tensor([-50.0, -44]).double(), gain=3.0, unit=2.0,
+        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=torch.from_numpy(table),
+        site=torch.zeros(2).long(), band=torch.arange(2), shared=torch.tensor(shared).double(),
+        doubt=torch.eye(8).double(), levels=torch.tensor([-50.0, -44]).double(), unit=2.0,
     )  # fmt: skip
     at = np.c_[rng.uniform(-400, 400, (40, 2)), np.full(40, 1.5)]
     number = np.arange(40) % 2
@@ -52,17 +47,16 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
         return own - 10 * (3.2 + change.get("exponent", 0)) * decades - bend * decades**2 + loss
 
     def slope(name: str, spread: float) -> np.ndarray:
-        return level({name: spread / 2}) - level({name: -spread / 2})
+        return level({name: float(spread) / 2}) - level({name: -float(spread) / 2})
 
     np.testing.assert_allclose(trend.mean(places), level({}), atol=1e-5)
     columns, terms = trend.shared_columns(places).numpy(), trend.columns(places).numpy()
     np.testing.assert_allclose(columns[:, 0], slope("exponent", SHARED_SPREAD[0]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 5], slope("tilt", SHARED_SPREAD[5]), atol=1e-5)
-    np.testing.assert_allclose(columns[:, 6:], 3.0 * np.eye(2)[number])
-    own = terms[:, :10].reshape(40, 2, 5)
+    np.testing.assert_allclose(columns[:, 6:], LEVEL_DB * np.eye(2)[number])
+    own = terms[:, :8].reshape(40, 2, 4)
     assert (own[np.arange(40), 1 - number] == 0).all()
     own = 2.0 * own[np.arange(40), number]
-    np.testing.assert_allclose(own[:, 0], 3.0)
-    np.testing.assert_allclose(own[:, 1], slope("azimuth", OWN_SPREAD[0]), atol=1e-5)
-    np.testing.assert_allclose(own[:, 4], OWN_SPREAD[3] * (trend.law.decades(places) - 2))
-    np.testing.assert_allclose(terms[:, 10:], columns / 2.0)
+    np.testing.assert_allclose(own[:, 0], slope("azimuth", OWN_SPREAD[0]), atol=1e-5)
+    np.testing.assert_allclose(own[:, 3], OWN_SPREAD[3] * (trend.law.decades(places) - 2))
+    np.testing.assert_allclose(terms[:, 8:], columns / 2.0)

@@ -1,7 +1,5 @@
 """The stand-in for Argos: its physics, its offsets, its layout."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.data.schema import LIGHT

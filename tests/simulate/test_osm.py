@@ -71,23 +71,15 @@ def test_one_building_suffices(tmp_path):
 
 FAR = [(40.0, -30.0), (40.0, -29.0), (41.0, -29.0), (41.0, -30.0)]
 SPOILT = {
-    "empty": "",
-    "words": "a town",
-    "html": "<html><body>503</body></html>",
-    "cut": extract()[:-40],
-    "binary": "\x00\x01\x02\x03OSMHeader",
-    "nothing": f"{HEAD}</osm>",
-    "no building": extract(tags=(("landuse", "grass"),)),
-    "building=no": extract(tags=(("building", "no"),)),
+    "empty": "", "words": "a town", "html": "<html><body>503</body></html>", "cut": extract()[:-40],
+    "binary": "\x00\x01\x02\x03OSMHeader", "nothing": f"{HEAD}</osm>",
+    "no building": extract(tags=(("landuse", "grass"),)), "building=no": extract(tags=(("building", "no"),)),
     "a point": extract(SQUARE[:1], [1, 1]),
-    "a line": extract([(40.0, -30.0), (40.0, -29.999), (40.0, -29.998)]),
-    "open": extract(ids=[1, 2, 3, 4]),
-    "missing nodes": extract(ids=[1, 2, 77, 78, 1]),
-    "no latitude": extract().replace("lat=", "latt="),
+    "a line": extract([(40.0, -30.0), (40.0, -29.999), (40.0, -29.998)]), "open": extract(ids=[1, 2, 3, 4]),
+    "missing nodes": extract(ids=[1, 2, 77, 78, 1]), "no latitude": extract().replace("lat=", "latt="),
     "beyond the pole": extract([(95.0, -30.0), (95.0, -29.999), (95.001, -29.999), (95.001, -30.0)]),
-    "not numbers": extract().replace('"40.0"', '"north"'),
-    "too wide": extract(FAR),
-}
+    "not numbers": extract().replace('"40.0"', '"north"'), "too wide": extract(FAR),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", SPOILT)

@@ -25,11 +25,7 @@ STYLES = {
     "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
     "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
 }
-SHORT = {
-    "perfect": ("k-o", "perfect"), "lmmse": ("g-o", "lmmse"), "predicted": ("b-o", "predicted"),
-    "predicted_variance": ("m--o", "predicted with its variance"),
-    "predicted_pilots": ("C5-o", "prediction corrected by pilots"),
-}  # fmt: skip
+SHORT = ("perfect", "lmmse", "predicted", "predicted_variance", "predicted_pilots")  # by acceptance
 RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),
@@ -84,9 +80,9 @@ def draw_acceptance(
     """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
     figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
     for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
-        for name in filter(SHORT.__contains__, rates):
-            style, label = SHORT[name]
-            axis.plot(rates.index, rates[name], style, label=label)
+        for name in filter(rates.__contains__, SHORT):
+            label, colour, _ = STYLES[f"{name}@accepted"]
+            axis.plot(rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted"))
         axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")

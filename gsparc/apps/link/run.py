@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -98,8 +98,8 @@ class LinkStudy:
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
         return beam_facts(every.true, every.predicted, accepted)
 
-    def rates(self, tick: Callable[[], None]) -> tuple[dict[Rule, list[Rates]], dict[str, Any]]:
-        """Rate adaptation at every noise level and its facts; `tick` is called after each."""
+    def rates(self) -> tuple[dict[Rule, list[Rates]], dict[str, Any]]:
+        """Rate adaptation at every noise level and its facts."""
         if not self.states_variance:
             text = "%s states no error variance: rates are adapted as if predictions were exact"
             log.warning(text, self.method.name)
@@ -107,13 +107,13 @@ class LinkStudy:
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = adapt(own, other, self.mcs["snr_db"], self.mcs, tick)
+        rates = adapt(own, other, self.mcs["snr_db"], self.mcs)
         return rates, rate_facts(rates, self.accepted)
 
     def send(
-        self, modulation: str, levels: list[float], tick: Callable[[str], None]
+        self, modulation: str, levels: list[float]
     ) -> tuple[dict[str, pd.DataFrame], tuple[float, pd.DataFrame], dict[str, Any]]:
-        """`curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]; `tick` is called before each."""
+        """`curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]."""
         begun = time.perf_counter()
         receivers = [r for r in self.receivers if self.states_variance or r not in NEED_VARIANCE]
         if len(receivers) < len(self.receivers):
@@ -125,7 +125,7 @@ class LinkStudy:
         how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
-        blocks = transmit(pusch, self.grid.band(), levels, sizes, tick)
+        blocks = transmit(pusch, self.grid.band(), levels, sizes)
         rates, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
         facts = pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):

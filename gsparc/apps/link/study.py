@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.apps.link.pusch import Pusch
+from gsparc.data.executor import each
 from gsparc.prediction.risk import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
@@ -76,7 +78,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
 
 
 def adapt(
-    band: Band, aside: Band, snr_db: list[float], settings: Mapping[str, Any], tick: Callable[[], None]
+    band: Band, aside: Band, snr_db: list[float], settings: Mapping[str, Any]
 ) -> dict[Rule, list[Rates]]:
     """Rates of both rules at noise levels that put the median position at `snr_db`.
 
@@ -84,7 +86,6 @@ def adapt(
         band: of the positions to be judged.
         aside: of others, on which care and backoff are chosen.
         snr_db, settings: see conf/link.yaml.
-        tick: called after each level.
 
     Raises:
         ValueError: every position is silent.
@@ -102,13 +103,14 @@ def adapt(
         for c in settings["care"]
     }
     care = max(delivered, key=lambda c: delivered[c])
-    rates: dict[Rule, list[Rates]] = {"expected": [], "target": []}
-    for noise in noises:
-        rates["expected"].append(loop.rates(band, noise, care, "expected"))
+
+    def at(noise: float) -> tuple[Rates, Rates]:
         backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
-        rates["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
-        tick()
-    return rates
+        target = loop.rates(band, noise, max(backed, key=lambda b: backed[b]))
+        return loop.rates(band, noise, care, "expected"), target
+
+    expected, target = zip(*(rates for _, rates in each(at, noises, "noise levels")), strict=True)
+    return {"expected": list(expected), "target": list(target)}
 
 
 def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray) -> dict[str, Any]:
@@ -164,27 +166,24 @@ def _by_regret(one: Rates) -> dict[str, float | None]:
     return facts
 
 
-def transmit(
-    pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int], tick: Callable[[str], None]
-) -> pd.DataFrame:
+def transmit(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int]) -> pd.DataFrame:
     """Blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
 
     Args:
         band: of the positions that blocks are sent over, by turns.
         sizes: blocks of the coarse look, of a full point, and of a batch.
-        tick: called with what is being done.
     """
     coarse, fine, batch = sizes
     order = np.arange(max(coarse, fine)) % len(band.true)
-    parts = []
-    for level in levels:
-        tick(f"{level:g} dB")
-        parts.append(pusch.run(band, level, order[:coarse], batch))
-        rate = parts[-1].groupby("receiver").failed.mean()
+
+    def at(level: float) -> list[pd.DataFrame]:
+        few = pusch.run(band, level, order[:coarse], batch)
+        rate = few.groupby("receiver").failed.mean()
         worst = max(rate["perfect"], rate["predicted"])  # which may have an error floor
-        if fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]:
-            parts.append(pusch.run(band, level, order[coarse:fine], batch))
-    return pd.concat(parts, ignore_index=True)
+        steep = fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]
+        return [few, pusch.run(band, level, order[coarse:fine], batch)] if steep else [few]
+
+    return pd.concat(chain(*(blocks for _, blocks in each(at, levels, "Eb/N0"))), ignore_index=True)
 
 
 def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:

@@ -36,7 +36,7 @@ from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
-from gsparc.models import checkpoint
+from gsparc.prediction.predictor import keep
 
 log = logging.getLogger(__name__)
 
@@ -146,12 +146,12 @@ def by_model(
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
     cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
-    locator, count = Locator.of(method, data, learned, unknown, start, cells, share), 0
+    locator, count = Locator.of(run.predictor, data.moving[learned], unknown, start, cells, share), 0
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
-        locator = Locator(locator.field, locator.cells, unknown, trust, locator.share)
+        locator = replace(locator, trust=trust)
         if config.store:
-            checkpoint.amend(config.ckpt, locating.trust_state(trust, unknown, locator.share))
+            keep(config.ckpt, locating.trust_state(trust, unknown, share))
     heard, placed = _snapshots(config, run)
     answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
@@ -168,11 +168,10 @@ def _trust(
     """Learned from training rows that were left out, and their number."""
     brief = {"run_dir": run_dir / "left_out", "seed": int(config.seed), "budget_s": float(config.calibrate_s)}
     try:
-        make, context = run.retraining(**brief)
+        learned = run.retraining(**brief)
     except DataError as error:
         raise DataError(f"{error}: calibrate=0 goes without") from None
-    folds = int(config.calibrate)
-    result = locating.trusted(make, run.data, run.split.folds[0], context, locator, folds, cells)
+    result = locating.trusted(learned, locator, int(config.calibrate), cells)
     log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
     return result
 

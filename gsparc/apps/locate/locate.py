@@ -60,4 +60,4 @@ def _locator(
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
     trust = restored(predictor.extra, unknown, share)
     cells = cover(local, MOST, places is not None)
-    return Locator(SiteField(predictor.method, site), cells, unknown, trust, share)
+    return Locator(SiteField(predictor), cells, unknown, trust, share)

@@ -19,12 +19,8 @@ from gsparc.apps.locate.posterior import Posterior, likeliest
 from gsparc.apps.locate.search import Looked, Unknown, misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, snapshots
-from gsparc.data.inner_folds import cut_inside
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
-from gsparc.models.method import Method
-from gsparc.models.per_station import for_links
-from gsparc.training.context import FitContext
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.refit import Learned
 
 log = logging.getLogger(__name__)
 
@@ -82,16 +78,15 @@ class Locator:
 
     @classmethod
     def of(
-        cls, method: Method, data: Measurements, rows: np.ndarray, unknown: Unknown, trust: Trust,
+        cls, predictor: Predictor, trained: np.ndarray, unknown: Unknown, trust: Trust,
         cells: Callable[[np.ndarray], Cells], share: float,
     ) -> Self:  # fmt: skip
-        """Of a method that was trained on rows (n,), with `cells` by their places (n, 3) [m, local].
+        """Of a model that was trained at places (n, 3) [m, local], with `cells` by these.
 
         Raises:
-            ValueError: both ends move, or the method states no variance.
+            ValueError: both ends move, or the model states no variance.
         """
-        field = SiteField(method, data.site)
-        return cls(field, cells(data.moving[rows][:, :3]), unknown, trust, share)
+        return cls(SiteField(predictor), cells(trained[:, :3]), unknown, trust, share)
 
     @cached_property
     def _coarse(self) -> Moments:
@@ -129,23 +124,22 @@ class Locator:
 
 
 def trusted(
-    make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, locator: Locator,
-    folds: int, cells: Callable[[np.ndarray], Cells],
-) -> tuple[Trust, int]:  # fmt: skip
+    learned: Learned, locator: Locator, folds: int, cells: Callable[[np.ndarray], Cells]
+) -> tuple[Trust, int]:
     """How far such a method is trusted, from training places that it left out, and their number.
 
-    The method is made and trained again without each of a few groups (`folds`) of its training rows, cut as
-    the test rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
+    The method is trained again without each of a few groups (`folds`) of its training rows, cut as the test
+    rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
     """
     groups: list[tuple[Locator, Snapshots]] = []
-    rng = np.random.default_rng(context.seed)
-    inner_folds = cut_inside(data, fold, context.split, folds, context.seed).folds
+    data, seed = learned.data, learned.context.seed
+    rng = np.random.default_rng(seed)
+    inner_folds = learned.cut(folds, seed).folds
     for number, inner in enumerate(inner_folds):
         log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
-        method = for_links(make, data)
-        method.fit(data, inner, context.within(f"group{number}"))
-        rows = np.union1d(inner.train, inner.val)
-        without = Locator.of(method, data, rows, locator.unknown, locator.trust, cells, locator.share)
+        method = learned.refit(inner, learned.context.within(f"group{number}"))
+        predictor, trained = Predictor(method, data.site), data.moving[np.union1d(inner.train, inner.val)]
+        without = Locator.of(predictor, trained, locator.unknown, locator.trust, cells, locator.share)
         heard = snapshots(data, inner.test)
         sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
         groups.append((without, heard.at(sample)))

@@ -1,4 +1,4 @@
-"""A trained method as a field of snapshots: mean and variance of all that would be heard at a place."""
+"""A trained model as a field of snapshots: mean and variance of all that would be heard at a place."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gsparc.apps.locate.snapshots import compared
 from gsparc.data.query import Query
-from gsparc.data.schema import Site
-from gsparc.models.method import Method, suited_threads
+from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # places that are asked about at a time
 DB = 10 / np.log(10)
@@ -34,17 +33,17 @@ class SiteField:
     """Answers for all stations of a site together.
 
     Args:
-        method: trained; its predictions have variances.
-        site: what it was trained on.
+        predictor: whose predictions have variances.
 
     Raises:
         ValueError: both ends move.
     """
 
-    def __init__(self, method: Method, site: Site) -> None:
+    def __init__(self, predictor: Predictor) -> None:
+        self.predictor, self.site = predictor, predictor.site
+        site = self.site
         if site.static_end is None:
             raise ValueError("locate: both ends move; one that stands still is needed")
-        self.method, self.site = method, site
         self.count = 1 if site.stations is None else len(site.stations)
 
     @torch.no_grad()
@@ -52,21 +51,19 @@ class SiteField:
         """Of places (G, 3) float64 [m, local].
 
         Raises:
-            ValueError: the method states no variance.
+            ValueError: the model states no variance.
         """
         parts = [self._chunk(chunk) for chunk in places.split(CHUNK)]
         return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
 
     def _chunk(self, places: Tensor) -> Moments:
-        site, many = self.site, len(places) * self.count
+        site = self.site
         station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
         query = Query.at(site, places.float().repeat_interleave(self.count, 0), station)
-        with suited_threads(self.method, many):
-            prediction = self.method.predict(query)
+        prediction = self.predictor.asked(query)
         if prediction.variance is None:
-            raise ValueError(
-                f"locate: {self.method.name} states no variance, and has no likelihood of a place"
-            )
+            name = self.predictor.method.name
+            raise ValueError(f"locate: {name} states no variance, and has no likelihood of a place")
         mean, variance = compared(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
             return Moments(mean.double(), variance)

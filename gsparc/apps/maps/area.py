@@ -15,7 +15,7 @@ from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import memory
 from gsparc.data.errors import DataError
-from gsparc.data.limits import finite
+from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null
 from gsparc.data.schema import Site
 from gsparc.prediction.query import usual_heights
 
@@ -85,12 +85,11 @@ def grid_of(
     Raises:
         DataError: an area that is none, no height, a step that gives no cells, or more than memory holds.
     """
+    check_arguments(locals(), step_m=or_null(POSITIVE), height_m=or_null(number(-FARTHEST, FARTHEST)))
     low, high, contains = _outline(site, area, plan)
     height = _height(site, height_m)
     width = high - low
-    step = float(np.sqrt(max(float(width.prod()), 1e-12) / CELLS)) if step_m is None else float(step_m)
-    if step_m is not None and not (np.isfinite(step) and step > 0):
-        raise DataError(f"step_m={step_m}: the side of a cell, above 0 metres, is needed")
+    step = step_m or float(np.sqrt(max(float(width.prod()), 1e-12) / CELLS))
     count = np.ceil(width / step - 1e-9)
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
     if needed > SHARE_OF_MEMORY * memory():
@@ -156,8 +155,6 @@ def _as_text(area: Any) -> str:
 
 def _height(site: Site | None, height_m: float | None) -> float:
     if height_m is not None:
-        if not (np.isfinite(height_m) and abs(height_m) < FARTHEST):
-            raise DataError(f"height_m={height_m}: a finite number of metres is needed")
         return float(height_m)
     if site is None:
         return HEIGHT

@@ -15,6 +15,7 @@ from scipy.stats import norm
 from gsparc.apps.maps.area import Grid
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
+from gsparc.data.limits import finite
 from gsparc.data.links.georeference import Georeference
 
 REFUSED = -1  # of `best_server`
@@ -251,14 +252,10 @@ def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequenc
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
         load = [load.get(name, 1.0) for name in stations]
-    try:
-        values = np.array(load, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise DataError(f"load={load}: a number from 0 to 1 is needed, or one per station") from None
-    if values.ndim > 1 or values.size not in (1, len(stations)):
-        raise DataError(f"load={load}: one number is needed, or {len(stations)}, one per station")
-    if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"load={load}: shares from 0 to 1 are needed")
+    values = finite(load)
+    if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
+        fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"
+        raise DataError(f"load={load}: {fault}")
     return np.broadcast_to(values, (len(stations),))
 
 

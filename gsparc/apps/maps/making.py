@@ -25,7 +25,7 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.method import HasJoint, HasPaths
+from gsparc.models.method import HasJoint
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -325,13 +325,13 @@ def _usual(
 
 def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:
     """Delay spread [ns] and azimuth [deg] of the strongest path (ny, nx), of models with paths."""
-    if not isinstance(predictor.method, HasPaths) or predictor.site.stations is not None:
+    if predictor.site.stations is not None:
         return {}
     layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
     for cells in _chunks(np.flatnonzero(best >= 0), CHUNK):
         try:
             paths = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
-        except ValueError:  # what was fitted has none
+        except ValueError:  # of another kind, or what was fitted has none
             return {}
         power = np.abs(paths.gain).astype(np.float64) ** 2
         power, delay = power.mean(axis=1), np.asarray(paths.delay_s, np.float64).mean(axis=1)

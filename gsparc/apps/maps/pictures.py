@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.transforms import Affine2D
 from scipy.ndimage import distance_transform_edt
 from scipy.ndimage import label as areas_of
@@ -36,7 +36,7 @@ from gsparc.evaluation.from_above import (
 from gsparc.prediction.predictor import Predictor
 
 MOST_OVERLAP = 5.0  # stations that the colours end with
-GREY = (170, 170, 170)  # of values that are not known
+GREY = "#AAAAAA"  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
 MOST_COLOURS = 10
@@ -56,12 +56,8 @@ class Legend:
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
-        with np.errstate(invalid="ignore"):
-            share = np.clip((values - self.low) / max(self.high - self.low, 1e-30), 0, 1)
-        known = np.isfinite(values)
-        rgb = np.round(255 * colormaps[self.colours](np.where(known, share, 0.0))[..., :3]).astype(np.uint8)
-        rgb[~known] = GREY
-        return rgb
+        share = Normalize(self.low, self.high, clip=True)(np.ma.masked_invalid(values))
+        return colormaps[self.colours].with_extremes(bad=GREY)(share, bytes=True)[..., :3]
 
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -13,18 +12,16 @@ from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import levels_at, map_of
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
-from gsparc.apps.maps.promise import Promise, evidence_of, without
+from gsparc.apps.maps.promise import Promise, evidence_of
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.schema import Measurements
+from gsparc.data.limits import check_arguments, choice, whole
 from gsparc.data.splits import Fold
-from gsparc.models.method import Method
 from gsparc.prediction.predictor import Predictor
-from gsparc.training.context import FitContext
+from gsparc.prediction.refit import Learned
 
 Goal = Literal["coverage", "worst"]
-GOALS = get_args(Goal)
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
@@ -103,10 +100,7 @@ def place_next(
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
     """
     site = predictor.site
-    if goal not in GOALS:
-        raise DataError(f"goal={goal}: one of {', '.join(GOALS)} is needed")
-    if type(count) is not int or count < 1:
-        raise DataError(f"count={count}: a whole number of at least 1 is needed")
+    check_arguments(locals(), goal=choice(*get_args(Goal)), count=whole(1))
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: the model of {site.name} knows no stations among which to put another")
     grid = coarse_grid(predictor, area, height_m)
@@ -154,27 +148,19 @@ def place_next(
     return Placing(candidates[order], value, low, high, before, goal, grid, still[:, :2], error)
 
 
-def new_station_error(
-    method: Method,
-    make: Callable[[], Method],
-    data: Measurements,
-    fold: Fold,
-    context: FitContext,
-    most: int = 4,
-) -> NewStation:
+def new_station_error(learned: Learned, most: int = 4) -> NewStation:
     """Leave out whole stations, up to `most`, and predict them from the others."""
+    data, known = learned.data, learned.rows
     assert data.site.stations is not None and data.station is not None
-    known = np.sort(np.concatenate([fold.train, fold.val]))
     heard = np.unique(data.station[known])
     if len(heard) < LEAST_STATIONS:
         return NewStation()
-    chosen = np.random.default_rng(context.seed).permutation(heard)[:most]
+    chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        learned = without(method, make, data, inner, context)
-        parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
+        parts.append(evidence_of(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
     errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
     means = np.array([error.mean() for error in errors if len(error)])
     pairs = zip(errors, means, parts, strict=False)

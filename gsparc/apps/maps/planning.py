@@ -20,7 +20,7 @@ from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import answering
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
-from gsparc.data.limits import finite
+from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
@@ -119,13 +119,8 @@ def plan_next(
     Raises:
         DataError: anything wrong with what is asked for.
     """
-    if type(count) is not int or count < 1:
-        raise DataError(f"count={count}: a whole number of at least 1 is needed")
-    for name, metres in (("route_m", route_m), ("length_m", length_m)):
-        if metres is not None and not (np.isfinite(metres) and metres > 0):
-            raise DataError(f"{name}={metres}: metres above 0 are needed")
-    if not (np.isfinite(least_gain_db) and least_gain_db >= 0):
-        raise DataError(f"least_gain_db={least_gain_db}: at least 0 dB is needed")
+    metres = {"route_m": or_null(POSITIVE), "length_m": or_null(POSITIVE)}
+    check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
     origin = None if predictor is None else predictor.site.georeference
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets = grid.places()

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,12 @@ from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrat
 from gsparc.apps.maps.levels import measured, predicted
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models import checkpoint
-from gsparc.models.method import Method, Reconditions, predictions
-from gsparc.models.per_station import PerStation, for_links, trained_stations
-from gsparc.training.context import FitContext
+from gsparc.models.method import Method, predictions
+from gsparc.prediction.predictor import keep
+from gsparc.prediction.refit import Learned
 
 KEY = "map"
 CHUNK = 512  # rows predicted at a time
@@ -79,7 +76,7 @@ class Promise:
 
     def keep(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
-        checkpoint.amend(path, {KEY: asdict(self)})
+        keep(path, {KEY: asdict(self)})
 
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
@@ -91,33 +88,21 @@ def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
     return Promise(evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"])
 
 
-def gather(
-    method: Method,
-    make: Callable[[], Method],
-    data: Measurements,
-    fold: Fold,
-    settings: PromiseSettings,
-    context: FitContext,
-) -> Promise:
+def gather(learned: Learned, settings: PromiseSettings) -> Promise:
     """Learn `settings.folds` times without blocks of the training rows, and ask about these.
 
-    A method that can forget rows does so, with its settings as they are; another one is fitted anew.
-
     Args:
-        method: fitted on the fold.
-        make: an unfitted copy of it.
-        data, fold: that the model learned from.
+        learned: the model, with its data.
         settings: see there.
-        context: of the refits.
 
     Raises:
         DataError: too few places for any block.
         ValueError: the method serves no part of the data.
     """
-    known = np.sort(np.concatenate([fold.train, fold.val]))
-    places = data.moving[known]
+    data = learned.data
+    places = data.moving[learned.rows]
     if settings.budget_s is not None:
-        context = replace(context, budget_s=settings.budget_s)
+        learned = replace(learned, context=replace(learned.context, budget_s=settings.budget_s))
     longest = float(np.ptp(places[:, -3:-1], axis=0).max())
     side = settings.block_m or longest / 10
     if not side > 0:
@@ -125,41 +110,18 @@ def gather(
 
     def evidence_without(number: int) -> Evidence:
         split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
-        cut = cut_inside(data, fold, split, 1, settings.seed + number // len(SIDES))
-        inner = answerable(method, data, cut.folds[0])
-        learned = without(method, make, data, inner, replace(context, split=split))
+        cut = learned.cut(1, settings.seed + number // len(SIDES), split)
+        inner = learned.answerable(cut.folds[0])
+        less = learned.without(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         unit = cut.unit[tried] + number * (len(data) + 1)
-        return evidence_of(learned, data, replace(inner, test=tried), unit)
+        return evidence_of(less, data, replace(inner, test=tried), unit)
 
     by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
     parts = [by_number[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
-    return Promise(evidence, places, station_of(data, known), side)
-
-
-def without(
-    method: Method, make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext
-) -> Method:
-    """A method that knows nothing of the test rows of a fold."""
-    if isinstance(method, Reconditions):
-        refit = method.reconditioned(data, np.sort(np.concatenate([fold.train, fold.val])))
-        if refit is not None:
-            return refit
-    refit = for_links(make, data)
-    with tempfile.TemporaryDirectory() as folder:
-        refit.fit(data, fold, replace(context, run_dir=Path(folder)))
-    return refit
-
-
-def answerable(method: Method, data: Measurements, fold: Fold) -> Fold:
-    """The fold without test rows of stations that too few training rows are left of."""
-    if not isinstance(method, PerStation):
-        return fold
-    known, _ = trained_stations(method.wrapped, data, fold)
-    assert data.station is not None
-    return replace(fold, test=fold.test[known[data.station[fold.test]]])
+    return Promise(evidence, places, station_of(data, learned.rows), side)
 
 
 def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:

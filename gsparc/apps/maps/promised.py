@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,9 @@ from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather, stored_promise
 from gsparc.data.errors import DataError
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 from gsparc.evaluation.open_runs import open_files
 from gsparc.models import checkpoint
-from gsparc.models.method import Method
-from gsparc.training.context import FitContext
+from gsparc.prediction.refit import Learned
 
 log = logging.getLogger(__name__)
 
@@ -39,32 +36,30 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     promise = None if settings.get("renew") else stored_promise(stored.extra)
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
-    method, make, data, fold, context = trained(path, settings["dataset"])
+    learned = trained(path, settings["dataset"])
     log.info("a promise for this map: %d fits without blocks of places", how.folds)
-    promise = gather(method, make, data, fold, how, context)
+    promise = gather(learned, how)
     promise.coverage(how.share)  # too little evidence is said before anything is stored
     promise.keep(path)
     return promise
 
 
-def trained(
-    path: str, dataset: dict[str, Any]
-) -> tuple[Method, Callable[[], Method], Measurements, Fold, FitContext]:
-    """A model, an unfitted copy, the very data and rows that it was trained on, and how.
+def trained(path: str, dataset: dict[str, Any]) -> Learned:
+    """A model with the very data and rows that it was trained on.
 
     Raises:
         DataError: they are gone, or are others.
     """
     try:
         run = open_files([path], dataset)
-        make, context = run.retraining()
+        learned = run.retraining()
     except (ValueError, OSError) as error:
         raise DataError(
             f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
         ) from None
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
-    return run.methods[0], make, run.data, run.split.folds[0], context
+    return learned
 
 
 def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:

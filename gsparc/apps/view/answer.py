@@ -9,7 +9,6 @@ import numpy as np
 
 from gsparc.apps.maps.levels import predicted
 from gsparc.data.schema import Site
-from gsparc.models.method import HasPaths
 from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
@@ -97,11 +96,9 @@ def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float, float, f
 
 
 def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
-    if predictor.site.kind != "csi" or not isinstance(predictor.method, HasPaths):
-        return None
     try:
         paths: Paths = predictor.paths(**ends)
-    except ValueError:  # what was fitted has none
+    except ValueError:  # of another kind, or what was fitted has none
         return None
     delay = np.asarray(paths.delay_s[0], np.float64).mean(axis=0) * 1e9
     towards = None if paths.direction is None else np.asarray(paths.direction[0], np.float64)

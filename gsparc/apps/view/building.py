@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.floor_plan import FloorPlan
@@ -18,12 +18,9 @@ from gsparc.apps.view.crossed import fans
 from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
-from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import SceneWalls, box_faces
-from gsparc.models.method import HasGaussians
-from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
@@ -158,30 +155,17 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
     return legend, legend.of(level)
 
 
-@torch.no_grad()
 def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
     """Gaussians that are rendered, in world coordinates; None: of a model without."""
-    predictor = viewed.predictor_of(station)
-    method, site = predictor.method, predictor.site
-    if isinstance(method, HasGaussians):
-        try:
-            cloud = method.gaussians(_query(site, measured))
-            return replace(cloud, means=cloud.means + site.origin)
-        except ValueError:
-            pass  # of this kind are only some of those that it fits
-    return None
-
-
-def _query(site: Site, measured: Measured | None) -> Query:
-    """Local places of both ends at which emissions are asked."""
-    box = site.moving_box[:, -3:]
-    places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
+    low, high = viewed.box()
+    places = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
     if measured is not None:
-        places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin
-    moving = torch.from_numpy(places).float()
-    if site.static_end is None:
-        return Query(torch.from_numpy(site.box.mean(0)).float().expand_as(moving), Pose.identity(moving))
-    return Query.at(site, moving)
+        places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)]
+    site = viewed.site
+    other = {} if site.static_end is not None else {"tx": site.box.mean(0) + site.origin}
+    with suppress(ValueError):  # of this kind are only some of those that it fits
+        return viewed.predictor_of(station).gaussians(**{site.moving_end: places}, **other)
+    return None
 
 
 def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:

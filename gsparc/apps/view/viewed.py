@@ -16,8 +16,7 @@ from gsparc.apps.maps.making import answering
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import aligned, open_files
-from gsparc.models import loading
-from gsparc.prediction.confidence import trusted_of
+from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -173,17 +172,17 @@ def open_viewed(
     data, test = None, np.zeros(0, np.int64)
     try:
         run = open_files([path], dataset)
-        method, stored, data = run.methods[0], run.stored[0], run.data
+        predictor, data = run.predictor, run.data
         if run.foreign is None:
             test = run.split.folds[0].test
         else:
             notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
     except (ValueError, OSError) as error:
-        method, stored = loading.load(path)
+        predictor = load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
-    site, trusted = stored.site.in_levels(unit), trusted_of(stored.extra)
+    predictor = predictor.in_levels(unit)
+    site = predictor.site
     data = None if data is None else aligned(data, site)
-    predictor = Predictor(method, site, trusted=trusted, extra=stored.extra)
     names, missing = answering(predictor, None if station is None else [station], key="station")
     for note in missing:
         log.warning(note)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from rich.console import RenderableType
 
 from gsparc.evaluation.console import open_console, warned_again
@@ -20,6 +21,11 @@ from gsparc.prediction.timing import machine_facts
 def run_directory() -> Path:
     """Where the running command writes."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def in_multirun() -> bool:
+    """Whether the running command is a job of a multirun."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:

@@ -33,6 +33,7 @@ RECORD = "job.json"  # in a cell's folder: its state, when it began, and whether
 FAILURE = "failure.txt"  # why it has failed
 WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a cell is done
 OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
 NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
@@ -65,7 +66,17 @@ class State:
         named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
         files = {name: value for name, value in named.items() if isinstance(value, str)}
         found = {name: _content_of(value) for name, value in files.items() if os.path.isfile(value)}
+        if os.path.isdir(root := files.get("dataset.root", "")):
+            inside = [str(file.relative_to(root)) for file in Path(root).rglob("*")]
+            found["dataset.root"] = _of_files(Path(root), inside)
         return cls(json.loads(json.dumps(named, default=str)), found, data, split, program(whole))
+
+    @classmethod
+    def unread(cls, config: DictConfig) -> State | None:
+        """Return the state by the bytes of its files, no data read; None where other files may be read."""
+        state = cls.of(config)
+        alone = state.settings.get("dataset._target_") == WHOLE and "dataset.file" in state.files
+        return state if alone or "dataset.root" in state.files else None
 
     def same(self, record: Mapping[str, Any], reuse: bool = False) -> bool:
         """Whether a record is of this state; `reuse`: whatever the program was."""
@@ -86,12 +97,14 @@ def finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] 
 
     Args:
         folder: of the cell.
-        state: of what is asked for.
+        state: of what is asked for, with its data or `State.unread`.
         reuse: whether a result of another program counts, too; its `program` and `git` say of which.
     """
     record = read_summary(folder / RECORD)
-    ended = record is not None and record.get("ended") and state.same(record, reuse)
-    return read_summary(folder / SUMMARY) if ended else None
+    if record is None or not record.get("ended"):
+        return None
+    same = state.same(record, reuse) or state.same(record.get("unread") or {}, reuse)
+    return read_summary(folder / SUMMARY) if same else None
 
 
 def once(
@@ -99,6 +112,7 @@ def once(
     state: State,
     work: Callable[[str | None], object],
     *,
+    unread: State | None = None,
     reuse: bool = False,
     again: bool = False,
 ) -> dict[str, Any]:
@@ -109,6 +123,7 @@ def once(
         state: of the cell.
         work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
             interrupted try has left, None to begin anew.
+        unread: the same state, by which it is found done before its data are read.
         reuse: see `finished`.
         again: one that is done is done anew.
 
@@ -123,7 +138,7 @@ def once(
     left = None
     if record is None or record.get("ended") or not state.same(record):
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
-        record = {**asdict(state), "began": time.time(), "ended": False}
+        record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
         _write(folder / RECORD, record)
     else:
         left = _last_state(folder, record["began"])

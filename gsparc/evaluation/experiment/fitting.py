@@ -15,12 +15,11 @@ from omegaconf import DictConfig
 
 from gsparc.data.executor import each
 from gsparc.data.files import no_room
-from gsparc.data.schema import Kind
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, finished, once
 from gsparc.evaluation.experiment.problem import Problem, compose
-from gsparc.evaluation.metric_formats import DECIDING, score_of
+from gsparc.evaluation.results import rows_of, score_db
 from gsparc.models.checkpoint import MODEL
 
 log = logging.getLogger(__name__)
@@ -47,15 +46,14 @@ class Filled:
     earlier: str = ""
 
     @property
+    def row(self) -> dict[str, Any]:
+        """Of the results."""
+        return rows_of(self.facts)[0]
+
+    @property
     def checkpoint(self) -> Path:
         """Of the first fold."""
         return next((file for file in self.folder.glob(f"fold0/{MODEL}")), self.folder / MODEL)
-
-
-def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
-    """The figure places are given by, as decibels of which more are better."""
-    figure = DECIDING[kind]
-    return score_of(figure, float(facts[f"test/{figure}"]))
 
 
 @dataclass(frozen=True)
@@ -151,8 +149,8 @@ def fill_all(
                 log.warning("%s failed: %s", here[number].cell, result)
                 continue
             found[str(result.cell)] = result
-            score = score_db(result.facts["dataset/kind"], result.facts)
-            log.info("%s: %.2f dB after %.1f s", result.cell, score, result.facts["time/train_s"])
+            row = result.row
+            log.info("%s: %.2f dB after %.1f s", result.cell, score_db(row), row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None

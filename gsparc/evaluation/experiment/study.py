@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +19,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, once
 from gsparc.evaluation.experiment.fit import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
+from gsparc.evaluation.results import under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
@@ -28,7 +29,6 @@ from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
-OF_CELL = ("effects", "rows", "value", "train_s", "train_cpu_s")
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
 
 
@@ -64,9 +64,8 @@ class Condition:
 
     def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Its part of a cell's summary."""
-        own = {name: facts[f"{self}/{name}"] for name in OF_CELL}
-        model = str(self.model(folder))
-        return {"what": self.what, "amount": self.amount, "figure": facts["figure"], "model": model, **own}
+        names = {"figure": facts["figure"], "model": str(self.model(folder))}
+        return {**asdict(self), **names, **under(facts, str(self))}
 
     def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Data and rows of a fold under this condition."""

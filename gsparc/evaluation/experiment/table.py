@@ -11,14 +11,18 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.experiment.fitting import Filled, score_db
+from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.metric_formats import DECIDING, heading_of
+from gsparc.evaluation.metric_formats import heading_of
+from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
+BESIDE = {  # figures beside the score, by their columns
+    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
+}  # fmt: skip
 CLOSE_DB = 0.5
 PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "budget_s", "method"]
@@ -34,18 +38,12 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
     """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
     rows = []
     for one in filled:
-        facts, kind = one.facts, one.facts["dataset/kind"]
-        figure, second = DECIDING[kind], SECOND[kind]
-        label = str(facts.get("model/label") or "")
+        own = one.row
+        second, label = SECOND[own["kind"]], str(own["label"] or "")
         rows.append({
-            **asdict(one.cell), "figure": figure, "value": float(facts[f"test/{figure}"]),
-            "train_s": facts["time/train_s"], "train_cpu_s": facts["time/train_cpu_s"],
-            "load": facts.get("machine/load"), "draws": one.drawn,
-            "score_db": score_db(kind, facts) + 0.0,  # -0.0 would be shown as such
-            "coverage": facts.get("test/interval/coverage_90"), "outage": facts.get("test/outage/brier"),
-            "after_constant": facts.get("test/rmse_db_after_constant"), "second": second,
-            "second_value": facts.get(f"test/{second}"), "earlier": one.earlier,
-            "label": label[label.find(" (") :] if " (" in label else "",
+            **own, **asdict(one.cell), "draws": one.drawn, "score_db": score_db(own), "second": second,
+            "second_value": own.get(second), **{name: own.get(key) for name, key in BESIDE.items()},
+            "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
     if not rows:
         return pd.DataFrame(columns=CELL)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -202,28 +203,20 @@ def others_of(
     return methods
 
 
-def columns_of(
-    points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float
-) -> dict[str, list[Any]]:
-    """Columns of `tradeoff.csv`, fastest point first."""
-    order = sorted(range(len(points)), key=lambda i: points[i].p50)
-    rows = [points[i] for i in order]
-    knobs = list(dict.fromkeys(knob for p in points for knob in p.settings))
-    return {
-        "label": [p.label for p in rows],
-        "render_ms_p50": [p.p50 for p in rows],
-        "render_ms_p95": [p.p95 for p in rows],
-        "ratio_to_copy": [p.p50 / copy_ms for p in rows],
-        **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
-        "difference_to_full": [p.difference[0] for p in rows],
-        "difference_se": [p.difference[1] for p in rows],
-        "closeness_db": [p.closeness_db for p in rows],
-        "front": [int(i in pareto) for i in order],
-        "kept_with_model": [int(i in chosen) for i in order],
-        "threads": [p.threads for p in rows],
-        "num_gaussians": [p.size for p in rows],
-        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in knobs},
-    }
+def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float) -> pd.DataFrame:
+    """A row a point, those of `tradeoff.csv`: the fastest first."""
+    rows = [
+        {
+            "label": p.label, "render_ms_p50": p.p50, "render_ms_p95": p.p95,
+            "ratio_to_copy": p.p50 / copy_ms, **p.figures,
+            "difference_to_full": p.difference[0], "difference_se": p.difference[1],
+            "closeness_db": p.closeness_db, "front": int(i in pareto), "kept_with_model": int(i in chosen),
+            "threads": p.threads, "num_gaussians": p.size,
+            **{f"set/{knob}": _cell(value) for knob, value in p.settings.items()},
+        }
+        for i, p in enumerate(points)
+    ]  # fmt: skip
+    return pd.DataFrame(rows, dtype=object).sort_values("render_ms_p50", kind="stable")
 
 
 def _cell(value: Any) -> Any:

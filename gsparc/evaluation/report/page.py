@@ -18,6 +18,7 @@ from gsparc.data.files import whole_file
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
 from gsparc.evaluation.report.table import Table
+from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
 
 PICTURE_PX = 1000  # width at which pictures are kept
@@ -32,14 +33,14 @@ class Study:
         title: dataset and split.
         remarks: what a reader must know first.
         tables: in reading order.
-        plots: titles, whether they take a whole line, and SVG texts.
+        plots: titles and SVG texts.
         pictures: captions and PNG data in base64.
     """
 
     title: str
     remarks: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    plots: list[tuple[str, bool, str]] = field(default_factory=list)
+    plots: list[tuple[str, str]] = field(default_factory=list)
     pictures: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -58,14 +59,10 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         study.tables.append(tables.seeds(runs))
     makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
     study.tables += [table for table in (make(runs) for make in makers) if table.rows]
-    figures = (
-        plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.latency_cdf(runs), plots.learning(runs),
-        plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
-    )  # fmt: skip
+    drawn = plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.learning(runs)
     study.plots = [
-        (str(figure.get_label()), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
-        for i, figure in enumerate(figures)
-        if figure is not None
+        (str(figure.get_label()), _unique_ids(plots.svg(figure), number))
+        for number, figure in enumerate(drawn)
     ]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
@@ -80,10 +77,9 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 def warnings(runs: Sequence[Run]) -> list[str]:
     """What a reader must know first, each once: the loads of a busy machine are one range."""
     remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
-    scored = [(figure, run) for run in runs if (figure := run.figure_of(run.figure)) is not None]
+    scored = [run for run in runs if run.row["value"] is not None]
     if scored:  # a baseline must beat the best run of the page
-        last = max if runs[0].kind == "spectrum" else min
-        remarks += better_baseline(last(scored, key=lambda one: one[0])[1].facts)
+        remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     if loads and max(loads) > BUSY:
         ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))
@@ -156,12 +152,10 @@ def _short(title: str, runs: Sequence[Run]) -> str:
     """The settings of a study over seeds, then the baselines."""
     runs = [replace(run, render_ms=np.zeros(0)) for run in runs]  # on the clock that timed the baselines
     table, facts = tables.seeds(runs), runs[0].facts
-    beside = [one for one in tables.baselines_of(runs[0]) if one.setting not in OMITTED_ROWS]
-    plain = tables.seeds(beside).rows if beside else ()
-    rows = [*table.rows, *([name, None, *rest] for name, _, *rest in plain)]  # baselines have no seeds
+    plain = [row for row in tables.beside(runs) if row[0] not in OMITTED_ROWS]
+    blank = [None] * (len(table.columns) - len(plain[0])) if plain else ()  # baselines have no seeds
+    rows = [*table.rows, *([name, *blank, *rest] for name, *rest in plain)]
     load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
     machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
     note = f"{machine}, load {load:.1f} per core; queries in turns."
-    columns = [i for i, column in enumerate(table.columns) if column.name not in OMITTED_COLUMNS]
-    short = [[row[i] for i in columns] for row in rows]
-    return Table(title, [table.columns[i] for i in columns], short, note).markdown()
+    return Table(title, table.columns, rows, note).without(*OMITTED_COLUMNS).markdown()

@@ -9,23 +9,20 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.table import interval, over_seeds
-from gsparc.evaluation.report.tables import baselines_of, curve, grouped, validation_figure
+from gsparc.evaluation.report.table import interval
+from gsparc.evaluation.report.tables import curve, grouped, validation_figure
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
-MOST_CONFIDENCES = 8
 BAND = 0.95
 TIMES = "render_ms"  # of single queries, beside the figures of samples
 CDFS: dict[Kind, tuple[str, ...]] = {
@@ -44,12 +41,12 @@ def svg(figure: Figure) -> str:
 
 def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
-    name, axes = runs[0].figure, _axes()
+    name, axes = runs[0].row["figure"], _axes()
     points: list[tuple[float, float]] = []
     for (setting, group), style in _styled(runs):
         for run in group:
-            p50, p95 = run.latency
-            estimate = interval(run, name)
+            p50, p95 = run.row["query_ms"], run.row["query_p95_ms"]
+            estimate = interval(run.row, name)
             if p50 is None or estimate is None:
                 continue
             axes.errorbar(
@@ -58,11 +55,11 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             )  # fmt: skip
             points.append((p50, estimate.value))
     for base in _rivals(runs):
-        value, (ms, _), look_of = base.figure_of(name), base.latency, look(base.setting)
-        if value is not None and ms is not None:
+        value, ms, look_of = base["value"], base["query_ms"], look(base["method"])
+        if ms is not None:
             axes.plot([ms], [value], **look_of.marked, ms=4)
             how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
-            axes.annotate(base.setting, (ms, value), (4, -3), **how)
+            axes.annotate(base["method"], (ms, value), (4, -3), **how)
             points.append((ms, value))
     for columns in fronts:
         if name in columns:
@@ -83,10 +80,10 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
-    name, axes = PER_SAMPLE[runs[0].kind], _axes()
+    name, axes = PER_SAMPLE[runs[0].row["kind"]], _axes()
     _cdfs(axes, runs, name)
     rival = runs[0].samples.get(f"baseline/gp/{name}")
-    if rival is not None and any(base.setting == "gp" for base in _rivals(runs)):
+    if rival is not None and any(base["method"] == "gp" for base in _rivals(runs)):
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
     axes.set_ylabel("share of samples")
@@ -94,29 +91,17 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
 
 
-def latency_cdf(runs: Sequence[Run]) -> Figure | None:
-    """Share of single queries that take at most so long; None where none were timed one by one."""
-    if not any(len(run.render_ms) for run in runs):
-        return None
-    axes = _axes()
-    _cdfs(axes, runs, TIMES)
-    logarithmic(axes)
-    axes.set_ylabel("share of queries")
-    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
-    return _finished(axes, title, "one query, end to end [ms]")
-
-
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     """The figure that ends a sweep: distributions over test samples and of single queries, as a PNG file.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
-    names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
+    names = [name for name in CDFS[runs[0].row["kind"]] if name in runs[0].samples]
     names += [TIMES] if any(len(run.render_ms) for run in runs) else []
     labels = {}
     for setting, group in grouped(runs).items():
-        seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
-        ms = np.mean([p50 for p50, _ in (run.latency for run in group) if p50 is not None])
+        seconds = np.mean([run.row["train_s"] for run in group])
+        ms = np.mean([run.row["query_ms"] for run in group if run.row["query_ms"] is not None])
         labels[setting] = f"{short(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
     figure, ((*line,),) = panels(4.2 * len(names), 3.9, 1, len(names))
     for axes, name in zip(line, names, strict=True):
@@ -175,100 +160,16 @@ def learning(runs: Sequence[Run]) -> Figure:
     return _finished(axes, "Validation accuracy against training time (band: seeds)", what)
 
 
-def costs(runs: Sequence[Run]) -> Figure:
-    """Points measured, seconds simulated, seconds trained, milliseconds a query, and the accuracy."""
-    groups = grouped(runs)
-    name = runs[0].figure
-    columns = {
-        "points measured": lambda run: float(run.measured),
-        "s simulated": lambda run: run.facts.get("dataset/simulate_s"),
-        "s trained": lambda run: run.facts.get("time/train_s"),
-        "ms a query": lambda run: run.latency[0],
-        heading_of(name): lambda run: run.figure_of(name),
-    }
-    columns = {title: of for title, of in columns.items() if any(of(run) is not None for run in runs)}
-    size = WIDE + 2, 1.2 + 0.35 * len(groups)
-    figure, (line,) = panels(*size, 1, len(columns), grid=False, sharey=True)
-    for panel, (title, value) in zip(line, columns.items(), strict=True):
-        for row, ((_, group), style) in enumerate(_styled(runs)):
-            spread = over_seeds([value(run) for run in group])
-            if spread is None:
-                panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
-                continue
-            panel.barh(row, spread.value, color=style["color"], alpha=0.8)
-            panel.errorbar([spread.value], [row], xerr=spread.bars, c="k", lw=0.8)
-            panel.text(spread.value, row, f" {spread.value:.3g}", va="center", fontsize=7)
-        panel.set_title(title, fontsize=8)
-        panel.tick_params(labelsize=7)
-        panel.margins(x=0.3)
-    line[0].set_yticks(range(len(groups)), [short(setting) for setting in groups])
-    line[0].invert_yaxis()
-    figure.set_label("Total costs (lines: spread over seeds)")
-    return figure
-
-
-def measurements(runs: Sequence[Run]) -> Figure | None:
-    """Accuracy against the number of measurements for every method; None when all runs had equally many."""
-    if len({run.measured for run in runs}) < 2:
-        return None
-    name, axes = runs[0].figure, _axes()
-    rows = [
-        (str(one.facts.get("model/name")), run.measured, one.figure_of(name))
-        for run in runs
-        for one in (run, *_rivals(runs, run))
-    ]
-    for method, own in pd.DataFrame(rows, columns=["method", "count", "value"]).groupby("method", sort=False):
-        band, style = own.dropna().groupby("count").value.agg(["mean", "min", "max"]), look(str(method))
-        axes.plot(band.index, band["mean"], ms=4, lw=1, label=method, **style.marked)
-        axes.fill_between(band.index, band["min"], band["max"], color=style.colour, alpha=0.15, lw=0)
-    logarithmic(axes)
-    _accuracy_axis(axes, name)
-    title = "Accuracy against the number of measurements (band: seeds)"
-    return _finished(axes, title, "measurements learned from")
-
-
-def confidence(runs: Sequence[Run]) -> Figure | None:
-    """Error against confidence, and the error of the most confident share of answers; None without any."""
-    name = PER_SAMPLE[runs[0].kind]
-    stating = [
-        r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()
-    ]
-    if not stating:
-        return None
-    figure, ((points, risk),) = panels(WIDE, TALL, 1, 2)
-    lines = [(run, style) for (_, group), style in _styled(stating) for run in group]
-    for run, style in lines[:MOST_CONFIDENCES]:
-        value, stated = sizes(run, name), run.samples["confidence"]
-        known = np.isfinite(value) & np.isfinite(stated)
-        stated, value = stated[known], value[known]
-        if len(stated) < 3 or np.ptp(stated) == 0:
-            continue
-        rank = spearmanr(stated, value).statistic
-        order, count = np.argsort(-stated, kind="stable"), np.arange(1, len(stated) + 1)
-        share, mean = count / len(count), np.cumsum(value[order]) / count
-        error = value.std(ddof=1) / np.sqrt(count)
-        color = style["color"]
-        points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
-        risk.plot(share, mean, lw=1, **style)
-        risk.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
-    points.set(xlabel="confidence", ylabel=heading_of(name))
-    risk.set_xlabel("share of answers used, most confident first")
-    risk.set_title("mean over the answers used (95 % band)", fontsize=8)
-    figure.set_label("Error against confidence")
-    _legend(points)
-    return figure
-
-
-def _rivals(runs: Sequence[Run], beside: Run | None = None) -> list[Run]:
-    """Baselines beside a run (the first) that no run is of."""
-    methods = {run.facts.get("model/name") for run in runs}
-    return [base for base in baselines_of(beside or runs[0]) if base.setting not in methods]
+def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Baselines beside the first run that no run is of."""
+    methods = {run.row["method"] for run in runs}
+    return [row for row in runs[0].baselines if row["method"] not in methods]
 
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:
     """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
     groups = grouped(runs)
-    names = [str(group[0].facts.get("model/name")) for group in groups.values()]
+    names = [str(group[0].row["method"]) for group in groups.values()]
     unique = len(set(names)) == len(names)
     styles = [look(name).line if unique else numbered(i) for i, name in enumerate(names)]
     return list(zip(groups.items(), styles, strict=True))

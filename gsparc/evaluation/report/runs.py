@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from gsparc.data.files import SUMMARY, load_yaml
-from gsparc.data.schema import Kind
-from gsparc.evaluation.metric_formats import DECIDING
+from gsparc.evaluation.baselines import BASELINES
 from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.results import rows_of
 from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.parts import leaves
-from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
@@ -49,15 +48,23 @@ class Run:
     render_ms: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
-    def kind(self) -> Kind:
-        """`spectrum`, `csi` or `rssi`."""
-        kind = self.facts.get("dataset/kind")
-        return kind if kind in DECIDING else "spectrum"
+    def row(self) -> dict[str, Any]:
+        """Its own row of the results, with `setting`, and times measured alone, where they were."""
+        own = {**self.rows[0], "setting": self.setting, "run": self}
+        if len(self.render_ms):
+            own["query_ms"], own["query_p95_ms"] = percentiles(self.render_ms)
+        return own
 
     @property
-    def figure(self) -> str:
-        """Name of the deciding accuracy."""
-        return DECIDING[self.kind]
+    def baselines(self) -> list[dict[str, Any]]:
+        """Rows of the plain baselines beside it, in the order of `BASELINES`."""
+        beside = {row["method"]: row for row in self.rows[1:] if row["value"] is not None}
+        return [{**beside[n], "setting": n, "run": self} for n in BASELINES if n in beside]
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """See `rows_of`; of unknown data those of spectra."""
+        return rows_of(self.facts)
 
     @cached_property
     def setting(self) -> str:
@@ -79,31 +86,9 @@ class Run:
         return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     @property
-    def effects(self) -> str:
-        """Propagation effects that the model computes; `none` where it has none."""
-        return self.facts.get("model/effects") or "none"
-
-    @property
     def study(self) -> tuple[str, str]:
         """What makes figures comparable: dataset and split by name."""
-        return str(self.facts.get("dataset/name")), str(self.facts.get("split/name"))
-
-    def figure_of(self, name: str) -> float | None:
-        """A test figure; None where it is absent or undefined."""
-        return number(self.facts.get(f"test/{name}"))
-
-    @property
-    def latency(self) -> tuple[float | None, float | None]:
-        """Median and 95th percentile of single queries [ms]; those measured alone, where they were."""
-        if len(self.render_ms):
-            return percentiles(self.render_ms)
-        return number(self.facts.get("time/render_ms_p50")), number(self.facts.get("time/render_ms_p95"))
-
-    @property
-    def measured(self) -> int:
-        """Measurements the method learned from."""
-        count = sum(int(self.facts.get(f"split/{k}") or 0) for k in ("train", "val"))
-        return count // max(int(self.facts.get("split/folds") or 1), 1)
+        return str(self.row["dataset"]), str(self.row["split"])
 
     @property
     def checkpoints(self) -> list[Path]:
@@ -194,16 +179,9 @@ def columns(path: Path) -> dict[str, np.ndarray]:
     """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file or rows."""
     if not path.is_file():
         return {}
-    with path.open(newline="", encoding="utf-8") as file:
-        heads, *rows = csv.reader(file)
-    return {name: _column(cells) for name, cells in zip(heads, zip(*rows, strict=True), strict=False)}
-
-
-def _column(cells: Sequence[str]) -> np.ndarray:
-    try:
-        return np.array([float(cell) if cell else np.nan for cell in cells])
-    except ValueError:
-        return np.array(cells)
+    frame = pd.read_csv(path, keep_default_na=False, na_values=[""])
+    frame = frame.astype(dict.fromkeys(frame.select_dtypes("number"), float))
+    return {} if frame.empty else {name: frame[name].to_numpy() for name in frame}
 
 
 def _overrides(path: Path) -> tuple[str, ...]:
@@ -216,11 +194,6 @@ def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     return dict(leaves(load_yaml(path.read_text(encoding="utf-8"), path) or {}))
-
-
-def number(value: object) -> float | None:
-    """As a float, None for anything that is no number."""
-    return float(value) if isinstance(value, (int, float)) else None
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
@@ -252,7 +225,7 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
         places = opened.data.moving[opened.split.folds[0].test] + opened.data.site.origin
-        calls[number] = Predictor(opened.methods[0], opened.data.site).cycling(places)
+        calls[number] = opened.predictor.cycling(places)
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }

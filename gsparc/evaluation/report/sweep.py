@@ -96,9 +96,9 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
 
 def _on_screen(table: Table) -> Shown:
     """What fits a terminal; the files have the rest."""
-    columns = [i for i, column in enumerate(table.columns) if column.name not in WIDE]
-    first, *others = (table.columns[i].name for i in columns)
-    rows = ([_spread(row[i], table.columns[i]) for i in columns] for row in table.rows)
+    table = table.without(*WIDE)
+    first, *others = (column.name for column in table.columns)
+    rows = (list(map(_spread, row, table.columns)) for row in table.rows)
     screen = summary.table(table.title, [first], others, rows)
     screen.caption = "least to largest over seeds; sweep.csv has more"
     return screen

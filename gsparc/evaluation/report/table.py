@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.summary import markdown_table
 
 DRAWS = 1000
 LEVEL = 0.95
+Row = Mapping[str, Any]  # of the results, with `setting` and `run`, see `Run.row`
 
 
 @dataclass(frozen=True)
@@ -55,17 +54,16 @@ def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int =
     return float(np.quantile(means, tail)), float(np.quantile(means, 1 - tail))
 
 
-def interval(run: Run, figure: str) -> Interval | None:
-    """A test figure of a run with its bootstrap interval over test samples; None without the figure."""
-    value, parts = run.figure_of(figure), _parts(run, figure)
+def interval(row: Row, figure: str) -> Interval | None:
+    """A test figure of a row with its bootstrap interval over test samples; None without the figure."""
+    value, parts = row.get(figure), None if row["baseline"] else _parts(row["run"].samples, figure)
     if value is None:
         return None
     return Interval(value) if parts is None else Interval(value, *bootstrap(*parts))
 
 
-def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
+def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Per-sample numbers whose (weighted) mean is the figure."""
-    own = run.samples
     if figure == "nmse" and "error_power" in own and "target_power" in own:
         known = np.isfinite(own["error_power"])
         return own["error_power"][known], own["target_power"][known]
@@ -92,17 +90,17 @@ class Column:
         name: as shown, with its unit.
         form: how numbers are written.
         note: what it means, for a reader who points at it.
-        of: a run's value: the key of a fact, or a function; unused where rows are given.
+        of: a result's value: a column of the results, or a function; unused where rows are given.
     """
 
     name: str
     form: str = ".4g"
     note: str = ""
-    of: str | Callable[[Run], Any] = ""
+    of: str | Callable[[Row], Any] = ""
 
-    def value(self, run: Run) -> Any:
-        """What a run has in this column: text, a number, an interval or None."""
-        return run.facts.get(self.of) if isinstance(self.of, str) else self.of(run)
+    def value(self, row: Row) -> Any:
+        """What a result has in this column: text, a number, an interval or None."""
+        return row.get(self.of) if isinstance(self.of, str) else self.of(row)
 
     def text(self, value: Any) -> str:
         """A cell as text."""
@@ -130,9 +128,15 @@ class Table:
     note: str = ""
 
     @classmethod
-    def of(cls, title: str, columns: Sequence[Column], runs: Sequence[Run], note: str = "") -> Table:
-        """A row per run."""
-        return cls(title, columns, [[column.value(run) for column in columns] for run in runs], note)
+    def of(cls, title: str, columns: Sequence[Column], results: Iterable[Row], note: str = "") -> Table:
+        """A row per result."""
+        return cls(title, columns, [[column.value(row) for column in columns] for row in results], note)
+
+    def without(self, *names: str) -> Table:
+        """The same but for some columns."""
+        kept = [i for i, column in enumerate(self.columns) if column.name not in names]
+        rows = [[row[i] for i in kept] for row in self.rows]
+        return Table(self.title, [self.columns[i] for i in kept], rows, self.note)
 
     @staticmethod
     def key(value: Any) -> str:
@@ -149,9 +153,7 @@ class Table:
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in ("low", "high"):
                     parts[f"{column.name} {end}"] = [getattr(cell, end, None) for cell in cells]
-        out = io.StringIO()
-        csv.writer(out, lineterminator="\n").writerows([parts, *zip(*parts.values(), strict=True)])
-        return out.getvalue()
+        return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
 
     def markdown(self) -> str:
         """A Markdown table under its title."""

@@ -6,21 +6,21 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of, score_of
-from gsparc.evaluation.report.runs import Run, number, sizes
-from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
+from gsparc.evaluation.report.runs import Run, sizes
+from gsparc.evaluation.report.table import Column, Interval, Row, Table, interval, over_seeds
 
-BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 WORST, LEVELS = 3, 3
-SETTING = Column("method and setting", of=lambda run: run.setting)
+SETTING = Column("method and setting", of="setting")
 SEED = Column("seed", "d", of="seed")
-TRAIN = Column("train s", ".3g", of="time/train_s")
-P50 = Column("query ms p50", ".3g", of=lambda run: run.latency[0])
-P95 = Column("p95", ".3g", of=lambda run: run.latency[1])
-SIZE = Column("Gaussians", "d", of="model/num_gaussians")
+TRAIN = Column("train s", ".3g", of="train_s")
+P50 = Column("query ms p50", ".3g", of="query_ms")
+P95 = Column("p95", ".3g", of="query_p95_ms")
+SIZE = Column("Gaussians", "d", of="gaussians")
 
 
 def accuracy(figure: str, note: str = "") -> Column:
@@ -36,60 +36,54 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return groups
 
 
-def baselines_of(run: Run) -> list[Run]:
-    """The baselines beside a run, as runs without files."""
-    figure, baselines = run.figure, []
-    for name in BASELINES:
-        stem = f"baseline/{name}/"
-        if stem + figure in run.facts:
-            own = {key.removeprefix(stem): v for key, v in run.facts.items() if key.startswith(stem)}
-            facts = {key: run.facts.get(key) for key in ("machine/load", "dataset/sha256", "git")}
-            facts |= {f"{room}/{key}": value for key, value in own.items() for room in ("test", "time")}
-            facts |= {"model/name": name, "dataset/kind": run.kind}
-            baselines.append(Run(run.folder, facts))
-    return baselines
-
-
 def results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, time, memory, size, effects, data and commit."""
     columns = [
         SETTING, SEED,
-        *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].kind]),
-        TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="time/render_ms_batch64"),
-        Column("memory MB", ".0f", of="memory/peak_mb"), SIZE,
-        Column("effects", of=lambda run: run.effects),
-        Column("load", ".2f", "1-minute load per core while measured", "machine/load"),
-        Column("data", of=lambda run: str(run.facts.get("dataset/sha256"))[:8]),
-        Column("commit", of=lambda run: str(run.facts.get("git"))[:8]),
+        *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].row["kind"]]),
+        TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
+        Column("memory MB", ".0f", of="memory_mb"), SIZE, Column("effects", of="effects"),
+        Column("load", ".2f", "1-minute load per core while measured", "load"),
+        Column("data", of=lambda row: str(row["data"])[:8]),
+        Column("commit", of=lambda row: str(row["git"])[:8]),
     ]  # fmt: skip
     note = (
         "Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
         "in turns within a run, the models of a sweep alone after it."
     )
-    return Table.of("Results", columns, [*runs, *baselines_of(runs[0])], note)
+    return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note)
 
 
 def seeds(runs: Sequence[Run]) -> Table:
     """Settings side by side, their spread over seeds, and what they cost."""
-    figures = [
-        Column(heading_of(f), form_of(f), of=partial(Run.figure_of, name=f)) for f in TABLES[runs[0].kind]
-    ]
-    alone = f"field/{runs[0].figure}"
-    if any(run.facts.get(alone) is not None for run in runs):
-        head = f"{heading_of(runs[0].figure)} of Gaussians alone"
-        figures.append(Column(head, form_of(runs[0].figure), of=alone))
-    spread = [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
     differs = differing(runs)
     also = [Column("differs, too")] if any(differs.values()) else []
-    columns = [SETTING, *also, Column("seeds", "d"), *spread]
+    spread = _spread_columns(runs)
     rows = [
         [
             setting, *([differs[setting]] if also else []), len(group),
-            *(over_seeds([number(c.value(run)) for run in group]) for c in spread),
+            *(over_seeds([column.value(run.row) for run in group]) for column in spread),
         ]
         for setting, group in grouped(runs).items()
     ]  # fmt: skip
+    columns = [SETTING, *also, Column("seeds", "d"), *spread]
     return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
+
+
+def beside(runs: Sequence[Run]) -> list[list[Any]]:
+    """Rows of the first run's baselines below those of `seeds`, but for what differs and the seeds."""
+    return [
+        [row["setting"], *(over_seeds([column.value(row)]) for column in _spread_columns(runs))]
+        for row in runs[0].baselines
+    ]
+
+
+def _spread_columns(runs: Sequence[Run]) -> list[Column]:
+    figures = [Column(heading_of(f), form_of(f), of=f) for f in TABLES[runs[0].row["kind"]]]
+    if any(run.row["alone"] is not None for run in runs):
+        deciding = runs[0].row["figure"]
+        figures.append(Column(f"{heading_of(deciding)} of Gaussians alone", form_of(deciding), of="alone"))
+    return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 
 def differing(runs: Sequence[Run]) -> dict[str, str]:
@@ -107,18 +101,17 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
 def costs(runs: Sequence[Run]) -> Table:
     """Total costs: measurements, simulation, training and query time."""
     columns = [
-        SETTING, SEED, Column("points measured", "d", of=lambda run: run.measured),
-        Column("seconds simulated", ".3g", of="dataset/simulate_s"),
-        Column("seconds trained", ".3g", of="time/train_s"),
-        Column("ms a query", ".3g", of=P50.of), accuracy(runs[0].figure),
+        SETTING, SEED, Column("points measured", "d", of="measured"),
+        Column("seconds simulated", ".3g", of="simulate_s"), Column("seconds trained", ".3g", of=TRAIN.of),
+        Column("ms a query", ".3g", of=P50.of), accuracy(runs[0].row["figure"]),
     ]  # fmt: skip
     note = "Seconds simulated: of the ray tracer that made the data; none where they were measured."
-    return Table.of("Total costs", columns, runs, note)
+    return Table.of("Total costs", columns, (run.row for run in runs), note)
 
 
 def worst(runs: Sequence[Run]) -> Table:
     """The three test positions with the largest error of each run."""
-    name = PER_SAMPLE[runs[0].kind]
+    name = PER_SAMPLE[runs[0].row["kind"]]
     numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]
     columns = [SETTING, SEED, Column("sample"), Column("where [m]"), *numbers]
     rows = []
@@ -131,7 +124,7 @@ def worst(runs: Sequence[Run]) -> Table:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             rival = own.get(f"baseline/gp/{name}")
             there = None if rival is None else float(rival[i])
-            head = [SETTING.value(run), SEED.value(run), str(own["name"][i]), place]
+            head = [run.setting, run.row["seed"], str(own["name"][i]), place]
             rows.append([*head, float(own[name][i]), there, float(own["confidence"][i])])
     note = "The moving end's position; the Gaussian process there shows whether it is hard for all."
     return Table("The three worst receivers", columns, rows, note)
@@ -145,12 +138,12 @@ def within_minutes(runs: Sequence[Run]) -> Table:
     figure = validation_figure(runs[0])
     score = partial(score_of, figure)
 
-    def best_within(run: Run, minutes: float) -> float | None:
-        seconds, values = curve(run)
+    def best_within(row: Row, minutes: float) -> float | None:
+        seconds, values = curve(row["run"])
         return max(values[seconds <= 60 * minutes], key=score, default=None)
 
-    def seconds_to(run: Run, level: float) -> float | None:
-        seconds, values = curve(run)
+    def seconds_to(row: Row, level: float) -> float | None:
+        seconds, values = curve(row["run"])
         good = [s for s, v in zip(seconds, values, strict=True) if score(v) >= score(level)]
         return good[0] if good else None
 
@@ -165,12 +158,13 @@ def within_minutes(runs: Sequence[Run]) -> Table:
         "Validation rows; seconds of learning with preparation, without validation. Methods that train "
         "in one piece have no curve: their test figure counts from the end of their training."
     )
-    return Table.of("Accuracy against training time", columns, [r for r in runs if len(curve(r)[0])], note)
+    known = (run.row for run in runs if len(curve(run)[0]))
+    return Table.of("Accuracy against training time", columns, known, note)
 
 
 def validation_figure(run: Run) -> str:
     """The figure of a learning curve: validation of channels and powers logs the mean squared error."""
-    return "psnr_db" if run.kind == "spectrum" else "mse"
+    return "psnr_db" if run.row["kind"] == "spectrum" else "mse"
 
 
 def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +174,7 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     if values is not None and np.isfinite(values).any():
         known = np.isfinite(values)
         return run.curve["seconds"][known], values[known]
-    end, value = number(run.facts.get("time/train_s")), run.figure_of(figure)
+    end, value = run.row["train_s"], run.row.get(figure)
     if end is None or value is None:
         return np.zeros(0), np.zeros(0)
     return np.array([end]), np.array([value])
@@ -201,7 +195,7 @@ def levels(runs: Sequence[Run]) -> list[float]:
 
 def effects(runs: Sequence[Run]) -> Table:
     """Gain and cost of each effect: paired differences between runs of one split."""
-    name = PER_SAMPLE[runs[0].kind]
+    name = PER_SAMPLE[runs[0].row["kind"]]
     columns = [
         Column("effect"), Column("without"), Column("with"), Column(f"{heading_of(name)} gained", "+.2f"),
         Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
@@ -209,9 +203,9 @@ def effects(runs: Sequence[Run]) -> Table:
     rows = []
     for off, on in product(runs, runs):
         if _differ_by_effect(off, on):
-            costs = [[number(column.value(run)) for run in (off, on)] for column in (TRAIN, P50)]
+            costs = [[column.value(run.row) for run in (off, on)] for column in (TRAIN, P50)]
             spent = [None if a is None or b is None else b - a for a, b in costs]
-            rows.append([on.effects, off.setting, on.setting, _paired(off, on, name), *spent])
+            rows.append([on.row["effects"], off.setting, on.setting, _paired(off, on, name), *spent])
     note = "Differences per test sample, mean and 95 % interval; same seed, same split."
     return Table("Effects: gain and cost", columns, rows, note)
 
@@ -219,7 +213,7 @@ def effects(runs: Sequence[Run]) -> Table:
 def _differ_by_effect(off: Run, on: Run) -> bool:
     names = ("dataset/sha256", "split/sha256", "seed", "model/name")
     same = all(off.facts.get(name) == on.facts.get(name) for name in names)
-    return same and off.effects == "none" != on.effects
+    return same and off.row["effects"] == "none" != on.row["effects"]
 
 
 def _paired(off: Run, on: Run, name: str) -> Interval | None:

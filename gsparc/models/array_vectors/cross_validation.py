@@ -45,14 +45,9 @@ class Tuned:
 
 
 def tune(
-    vectors: np.ndarray,
-    positions: np.ndarray,
-    images: np.ndarray,
-    matrix: np.ndarray,
-    wavelength: float,
-    partner: np.ndarray | None,
-    seed: int = 0,
-) -> Tuned:
+    vectors: np.ndarray, positions: np.ndarray, images: np.ndarray, matrix: np.ndarray, wavelength: float,
+    partner: np.ndarray | None, seed: int = 0,
+) -> Tuned:  # fmt: skip
     """Choose a kernel.
 
     Args:

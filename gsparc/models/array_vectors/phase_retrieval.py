@@ -137,13 +137,13 @@ class _Problem:
 
     @staticmethod
     def of(site: Site, images: np.ndarray) -> _Problem:
-        assert site.array is not None and site.grid is not None and site.wavelength is not None
-        known = lags(site.array, site.wavelength)
-        basis = known.basis(site.grid, site.wavelength)
+        array, grid, wavelength = site.array_geometry()
+        known = lags(array, wavelength)
+        basis = known.basis(grid, wavelength)
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
         forms = torch.einsum("ij,jkl->ikl", r, known.forms())
         projector = q / len(basis) ** 0.5
-        parts: list[list[Tensor]] = [[], [], [], []]
+        parts = []
         step = 1 / 255 if images.dtype == np.uint8 else 1e-4
         for block in np.array_split(images, max(1, len(images) // 256)):
             image = torch.from_numpy(block.reshape(len(block), -1)).double()
@@ -152,9 +152,8 @@ class _Problem:
             outside = image.square().square().mean(1) - z2.square().sum(1)
             # A rounding error e of the amplitude a is 2 a e of its square.
             rounding = 2 * image.square().mean(1).sqrt() * step / 12**0.5
-            for part, value in zip(parts, (z2, z1, outside.clamp_min(0).sqrt(), rounding), strict=True):
-                part.append(value)
-        z2, z1, floor, expected = (torch.cat(part) for part in parts)
+            parts.append((z2, z1, outside.clamp_min(0).sqrt(), rounding))
+        z2, z1, floor, expected = (torch.cat(part) for part in zip(*parts, strict=True))
         flat = forms.permute(1, 0, 2).reshape(len(forms[0]), -1).contiguous()
         minmax = site.normalisation == "minmax"
         return _Problem(flat, z2, z1, projector.sum(0), floor, expected.clamp_min(1e-9), minmax)

@@ -100,17 +100,16 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
     if not len(rows):
         raise ValueError("the training set is empty")
-    assert site.array is not None and site.grid is not None and site.wavelength is not None
-    watch = TimeBudget()
+    (array, grid, wavelength), watch = site.array_geometry(), TimeBudget()
     recovery, training = recovered(data, rows, seed)
     elapsed = watch.counted
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         report(recovery, data, rows, run_dir / "array_recovery.csv")
-    matrix = steering(site.array, site.grid, site.wavelength).numpy()
-    partner, places = mirror_elements(site.array), data.tx[rows]
+    matrix = steering(array, grid, wavelength).numpy()
+    partner, places = mirror_elements(array), data.tx[rows]
     core = covering(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
-    tuned = tune(recovery.vectors[core], places[core], images, matrix, site.wavelength, partner, seed)
+    tuned = tune(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
     kernel = tuned.kernel
     vectors = np.empty(recovery.vectors.shape, np.complex128)
     vectors[core] = aligned_by(recovery.vectors[core], places[core], partner, kernel)
@@ -130,7 +129,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
             features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
-        torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
+        torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
         fit_errors(tuned.unknown, tuned.error),
         tuned.left_out,
         elapsed,

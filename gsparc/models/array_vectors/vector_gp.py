@@ -142,13 +142,9 @@ def aligned_by(
 
 
 def aligned_to(
-    vectors: np.ndarray,
-    positions: np.ndarray,
-    known: np.ndarray,
-    places: np.ndarray,
-    partner: np.ndarray | None,
-    kernel: Kernel,
-) -> np.ndarray:
+    vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
+    partner: np.ndarray | None, kernel: Kernel,
+) -> np.ndarray:  # fmt: skip
     """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
 
     Args:

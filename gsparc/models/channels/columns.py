@@ -7,8 +7,9 @@ independent: an antenna half a metre on hears another field.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.models.run_factors import aligning, run_quadratic
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
+from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 
 NOBODY = -1  # in place of a station's number: none of them
@@ -57,23 +59,43 @@ class Slot:
             return moving
         return moving + rotation @ self.element
 
+    def state(self) -> dict[str, Any]:
+        """What `read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
+        return {**vars(self), "end": self.end[:0] if self.end.isnan().any() else self.end}
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Slot:
+        """Inverse of `state`."""
+        end = state["end"] if len(state["end"]) else torch.full((3,), math.nan, dtype=torch.float64)
+        entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
+        return cls(**{**state, **entries, "end": end})
+
 
 @dataclass(frozen=True)
-class Group:
-    """Training rows of one slot.
+class At:
+    """Places of one slot.
 
     Attributes:
         slot: whose.
+        places: (n, 3) float64 [m], or (n, 6) where both ends move.
+    """
+
+    slot: Slot
+    places: Tensor
+
+
+@dataclass(frozen=True)
+class Group(At):
+    """Training rows of one slot.
+
+    Attributes:
         rows: (n,) int64 into the rows that were gathered.
-        places: (n, 3) float64 [m].
         target: (n, D) complex128, stored units.
         run: (n,) int64 numbers of runs.
         order: (n,) float64 numbers among the static end's measurements, in the order they were taken.
     """
 
-    slot: Slot
     rows: Tensor
-    places: Tensor
     target: Tensor
     run: Tensor
     order: Tensor
@@ -83,8 +105,27 @@ class Group:
 
     def take(self, index: Tensor) -> Group:
         """The rows (m,) of these numbers."""
-        parts = (self.rows, self.places, self.target, self.run, self.order)
-        return Group(self.slot, *(part[index] for part in parts))
+        return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
+
+    def drawn(self, rows: float) -> Group:
+        """At most so many rows, drawn evenly."""
+        if len(self) <= rows:
+            return self
+        index = np.random.default_rng(0).permutation(len(self))[: int(rows)]
+        return self.take(torch.from_numpy(np.sort(index)))
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+
+    def state(self, factors: Tensor) -> dict[str, Any]:
+        """What `read` reads; targets as measured, of runs of these factors."""
+        target = self.target * factors[self.run][:, None]
+        return {**self._tensors(), "slot": self.slot.state(), "target": target}
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Group:
+        """Inverse of `state`."""
+        return cls(**{**state, "slot": Slot.read(state["slot"])})
 
     @cached_property
     def displacements(self) -> bytes:
@@ -108,14 +149,9 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
             all columns of a station are one, measured at the moving end's place at the carrier.
     """
     refuse(data.site)
-    if data.run is None:
-        run = np.zeros(len(rows), np.int64)
-    else:
-        run = np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
-    station = np.zeros(len(rows), np.int64)
-    if data.station is not None and data.site.stations is not None:
-        station = data.station[rows]
-    numbers_of = _order_of(data)
+    alike, order = np.zeros(len(rows), np.int64), _order_of(data)
+    run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
+    station = alike if data.station is None or data.site.stations is None else data.station[rows]
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
     target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
@@ -130,18 +166,17 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
             here = torch.from_numpy(measured)
             chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
             places = slot.places(moving[here], turned[here])
-            order = torch.from_numpy(numbers_of[rows[measured]])
-            groups.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
+            when = torch.from_numpy(run[measured]), torch.from_numpy(order[rows[measured]])
+            groups.append(Group(slot, places, here, chosen, *when))
     return tuple(groups)
 
 
 def _order_of(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station."""
-    if data.station is None:
-        return np.arange(len(data), dtype=np.float64)
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
     order = np.empty(len(data))
-    for number in np.unique(data.station):
-        mine = np.flatnonzero(data.station == number)
+    for number in np.unique(station):
+        mine = np.flatnonzero(station == number)
         order[mine] = np.arange(len(mine))
     return order
 
@@ -158,12 +193,9 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
-        elements = [
-            ((a,), centre, offsets[a])
-            if site.static_end == "tx"
-            else ((a,), centre + rotation @ offsets[a], zero)
-            for a in range(antennas)
-        ]
+        moves = site.static_end == "tx"
+        both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
+        elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
     for band in bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
@@ -223,14 +255,41 @@ def ends_of(groups: tuple[Group, ...]) -> int:
     return len({group.slot.station for group in groups})
 
 
-def run_factors_of(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
-    """Factors of runs (runs,) complex128, as measured over the largest one's, by the groups' covariances.
+def aligned(
+    groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
+) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
+    """Factors of runs (runs,) complex128, as measured over the largest one's, and what groups say without.
 
     Of several ends that share them phases alone: what a run has changed beside its phase is each end's own,
     and would be taken for a level of all.
+
+    Args:
+        groups: as measured.
+        covariances: (n, n) of each, known up to a factor.
+        runs: number.
+        factors: of runs, estimated by likelihood unless given.
     """
-    if runs == 1:
-        return torch.ones(1, dtype=torch.complex128)
+    solved = [Factor.of(covariance) for covariance in covariances]
+    if factors is None:
+        factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _run_factors(groups, solved, runs)
+    known = []
+    for group, factor in zip(groups, solved, strict=True):
+        target = group.target / factors[group.run][:, None]
+        known.append((replace(group, target=target), Conditioned(factor, target, factor.solved(target))))
+    return factors, known
+
+
+def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
+    """Negative log likelihood [nats] of what `aligned` says, scales profiled out."""
+    nll = 0.0
+    for group, given in known:
+        count, outputs = given.values.shape
+        nll += outputs * (count * math.log(max(given.scale, 1e-300)) + float(given.factor.log_determinant))
+        nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
+    return nll
+
+
+def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
@@ -249,11 +308,4 @@ def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> 
     Groups of as many rows keep the same ones.
     """
     chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
-    subset = []
-    for number in chosen:
-        group = groups[number]
-        if len(group) > rows:
-            index = np.sort(np.random.default_rng(0).permutation(len(group))[: int(rows)])
-            group = group.take(torch.from_numpy(index))
-        subset.append(group)
-    return tuple(subset)
+    return tuple(groups[number].drawn(rows) for number in chosen)

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import Group, Slot
-from gsparc.models.channels.covariance import Values, prior, waves_of
-from gsparc.physics.mirror_planes import images
+from gsparc.models.channels.columns import At, Group, Slot
+from gsparc.models.channels.prior import ChannelPrior
+from gsparc.models.channels.terms import Direct
+from gsparc.models.channels.terms.spherical import Spherical
 
 
 @dataclass(frozen=True)
@@ -29,13 +30,13 @@ class Common:
     level: float
 
     @staticmethod
-    def of(values: Values, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
+    def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
         """From groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
-            waves, power, away = _waves(values, group.slot, group.places)
+            waves, power, away = _waves(prior, group)
             gains.append(away * power * (waves.conj() @ alpha).mean(1))
-            levels.append(scale * float(_away(values, group.slot)) ** 2)
+            levels.append(scale * float(_away(prior, group.slot)) ** 2)
         each = torch.stack(gains)
         count, gain = len(each), each.mean(0)
         whole, mean = each.abs().square().mean(0), gain.abs().square()
@@ -47,28 +48,27 @@ class Common:
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
         return Common(gain * reliability, explained, sum(levels) / count)
 
-    def at(self, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def at(self, prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
-        before = self.level / _away(values, slot) ** 2 * prior(values, slot, places)
-        waves, _, away = _waves(values, slot, places)
+        before = self.level / _away(prior, at.slot) ** 2 * prior.variance(at)
+        waves, _, away = _waves(prior, at)
         waves = waves / away[:, None]
         after = before - self.explained @ waves.abs().square()
         return self.gain @ waves, after.clamp_min(0), before
 
 
-def _waves(values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Waves (J, n) of an end and its images, their powers (J,) and distances to the middle (J,) [m]."""
-    if not values.direct:
-        none = places.new_zeros(0)
-        return places.new_zeros(0, len(places), dtype=torch.complex128), none, none
-    end = slot.end + values.offset
-    placed = torch.cat([end[None], images(end, values.planes, values.sequences)])
-    away = torch.linalg.vector_norm(placed - values.middle, dim=-1)
-    return waves_of(values, slot, places), values.gains()[0], away
+def _waves(prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
+    """Waves (J, n) of an end and its images, powers (J,) of fixed gains and distances to the middle (J,)."""
+    terms = [term for term in prior.terms if isinstance(term, Spherical)]
+    if not terms:
+        none = at.places.new_zeros(0)
+        return at.places.new_zeros(0, len(at.places), dtype=torch.complex128), none, none
+    each = [(term.waves(at), term.gains[0], term.away(at.slot)) for term in terms]
+    waves, power, away = (torch.cat(parts) for parts in zip(*each, strict=True))
+    return waves, power, away
 
 
-def _away(values: Values, slot: Slot) -> Tensor:
+def _away(prior: ChannelPrior, slot: Slot) -> Tensor:
     """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
-    if not values.direct:
-        return torch.ones((), dtype=torch.float64)
-    return torch.linalg.vector_norm(slot.end + values.offset - values.middle)
+    direct = prior.get(Direct)
+    return torch.ones((), dtype=torch.float64) if direct is None else direct.away(slot)[0]

@@ -23,11 +23,11 @@ from gsparc.data.links.stations import numbered
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.channels.columns import Group, Slot, aligned, misfit
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
-from gsparc.models.run_factors import RunFactors, run_factors
+from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
@@ -46,6 +46,7 @@ TRIED_ON = 300  # of these, rows whose density given their neighbours chooses th
 ENTRIES = 64  # of their channels
 REFINED = 3  # walks to the two lengths
 NAMED = 6  # factors of runs that a note gives
+ANY = Slot(0, (), (), torch.zeros(3), torch.zeros(3), 0.0)  # kernels know of no end
 
 
 class ComplexGP(ClosedForm, kind="aligned"):
@@ -79,7 +80,6 @@ class ComplexGP(ClosedForm, kind="aligned"):
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
-        self.first = torch.arange(len(known))
         one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
         many = len(known) > MOST_ROWS and one_run
         notes = self._fit_many(data, known) if many else self._fit_whole(data, known)
@@ -104,24 +104,21 @@ class ComplexGP(ClosedForm, kind="aligned"):
 
     def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
-        places, notes = torch.from_numpy(data.moving[known]), []
+        places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         names, run = np.unique(
             np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
         )
-        some = torch.arange(len(known))
-        if len(known) > CHOSEN_ON:
-            some = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]))
+        rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
+        few = rows.drawn(CHOSEN_ON)
+        if len(few) < len(rows):
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-        looked_at = places[some], target[some], run[some.numpy()]
-        kernel = min(self._kernels(places[some], target[some]), key=lambda one: _aligned(one, *looked_at)[0])
-        _, conditioned, aligning = _aligned(kernel, places, target, run)
-        power = max(float((target * aligning[:, None]).abs().square().mean()), 1e-30)
-        prior = Prior(replace(kernel, amplitude=power))
-        self.posterior = Exact.of(prior, places, conditioned.values, None, conditioned.factor)
-        self.turned = 1 / aligning
-        first = torch.from_numpy(np.unique(run, return_index=True)[1])
-        self.runs = RunFactors(names.astype(np.int64), self.turned[first])
+        kernels = self._kernels(few.places, few.target)
+        kernel = min(kernels, key=lambda one: misfit(*_aligned(one, few, len(names))))
+        factors, ((_, told),) = _aligned(kernel, rows, len(names))
+        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), 1e-30)))
+        self.posterior = Exact.of(prior, places, told.values, None, told.factor)
+        self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
             notes.append(self._factors_note(names, run))
         return notes
@@ -134,10 +131,10 @@ class ComplexGP(ClosedForm, kind="aligned"):
         targets = torch.from_numpy(take(data.target, known).reshape(len(known), -1))
         place = torch.from_numpy(numbered(data.moving[known]))
         _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
-        self.first, counts = torch.from_numpy(first), torch.from_numpy(count).double()
+        counts = torch.from_numpy(count).double()
         means, scatter = targets, torch.zeros(len(count), dtype=torch.float64)
         if len(count) == len(known):  # no copy of what may be gigabytes
-            self.first = torch.arange(len(known))
+            first = np.arange(len(known))
         else:
             means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(
                 0, place, targets
@@ -145,7 +142,7 @@ class ComplexGP(ClosedForm, kind="aligned"):
             means /= counts[:, None].float()
             scatter.index_add_(0, place, targets.abs().square().mean(1).double())
             scatter = (scatter - counts * means.abs().square().mean(1)).clamp_min(0)
-        values = Values(data.moving[known[self.first.numpy()]], means, counts)
+        values = Values(data.moving[known[first]], means, counts)
         near = Neighbourhood.of(values.places, 0)
         row = covering(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
@@ -156,7 +153,7 @@ class ComplexGP(ClosedForm, kind="aligned"):
         power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
         prior = Prior(replace(kernel, amplitude=power))
         self.posterior = given(prior, values, 0, most=NEAREST)
-        self.turned, self.runs = torch.ones(1, dtype=torch.complex128), RunFactors.none()
+        self.runs = RunFactors.none()
         of = f"of {len(count)} places, of" if len(count) < len(known) else "of"
         by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
         return [by, f"settings chosen on {len(row)} of them, each given its nearest"]
@@ -188,39 +185,24 @@ class ComplexGP(ClosedForm, kind="aligned"):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        own = {"posterior": self._fitted().state(), "turned": self.turned, "first": self.first}
-        return {**own, **self.runs.state(), "shape": list(self.shape)}
+        return {"posterior": self._fitted().state(), **self.runs.state(), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
         self.posterior = posterior_of(state["posterior"])
-        self.turned, self.first, self.runs = state["turned"], state["first"], RunFactors.read(state)
+        self.runs = RunFactors.read(state)
 
     def size(self) -> int:
         """Training samples kept."""
         return 0 if self.posterior is None else len(self.posterior.places)
 
 
-def _aligned(
-    kernel: Kernel, places: Tensor, target: Tensor, run: np.ndarray
-) -> tuple[float, Conditioned, Tensor]:
-    """Negative log likelihood of the best power and runs' factors, channels given these, what aligns rows.
-
-    Args:
-        kernel: of unit power.
-        places, target, run: (n, D) [m], (n, R) complex128 and (n,) numbers.
-    """
-    gram = kernel.between(places, places)
+def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
+    """See `columns.aligned`; of a kernel of unit power."""
+    gram = kernel.between(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
-    factor, aligning = Factor.of(gram), torch.ones(len(places), dtype=torch.complex128)
-    if len(np.unique(run)) > 1:
-        number = np.unique(run, return_inverse=True)[1]
-        aligning = torch.from_numpy(run_factors(factor.inverse.numpy(), target.numpy(), number)[number])
-        target = target * aligning[:, None]
-    conditioned = Conditioned(factor, target, factor.solved(target))
-    nll = math.log(max(conditioned.scale / 2, 1e-300)) + float(factor.log_determinant) / len(places)
-    return 0.5 * nll - float(aligning.abs().log().mean()), conditioned, aligning
+    return aligned((rows,), [gram], runs)
 
 
 def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,19 +15,11 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import Group, Slot, gather, query_ends, run_factors_of, static_place
+from gsparc.models.channels.columns import At, Group, Slot, aligned, gather, query_ends, static_place
 from gsparc.models.channels.common import Common
-from gsparc.models.channels.covariance import (
-    Values,
-    diffuse_of,
-    directional,
-    disturbance,
-    explained,
-    prior,
-    signals,
-    specular,
-)
 from gsparc.models.channels.initial import ChannelSettings, find_terms
+from gsparc.models.channels.prior import ChannelPrior
+from gsparc.models.channels.terms import Direct, Images
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
@@ -39,7 +31,6 @@ from gsparc.training.context import FitContext, FitReport
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
 CHECKED = 64  # rows that this is tried at
-NUMBERS = ("power", "envelope", "gain", "offset", "towards", "planes")  # of `Values`
 
 
 @dataclass(frozen=True)
@@ -90,7 +81,7 @@ class ChannelField(ClosedForm, kind="diffuse"):
 
     name = "waves"
     site: Site
-    values: Values  # the terms and their numbers
+    prior: ChannelPrior
     channel: tuple[int, int]  # (A, K) of the targets
 
     def __init__(self, settings: ChannelSettings | None = None) -> None:
@@ -101,13 +92,6 @@ class ChannelField(ClosedForm, kind="diffuse"):
         self.rows = np.zeros(0, np.int64)
         self.runs = RunFactors.none()
 
-    @classmethod
-    def of(cls, site: Site, values: Values, channel: tuple[int, int]) -> ChannelField:
-        """One of known terms, to be conditioned; of channels of a known carrier."""
-        result = cls()
-        result.site, result.values, result.channel = site, values, channel
-        return result
-
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose terms and their powers from training and validation rows, and condition on these.
 
@@ -116,37 +100,29 @@ class ChannelField(ClosedForm, kind="diffuse"):
         """
         budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
         self.site, self.channel = data.site, (int(data.target.shape[1]), int(data.target.shape[2]))
-        self.values, notes = find_terms(data, rows, self.settings, budget)
+        self.prior, notes = find_terms(data, rows, self.settings, budget)
         self.condition(data, rows)
         return FitReport(budget.counted.wall, notes, budget.limited_by)
 
     @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.values.direct or self.size() > 0
+        return self.prior.get(Direct) is not None or self.size() > 0
 
     def size(self) -> int:
         """Images."""
-        return self.values.count
+        images = self.prior.get(Images)
+        return 0 if images is None else len(images.planes)
 
     @property
     def terms(self) -> tuple[str, ...]:
         """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `mirrors`, `drift`."""
-        shape = self.values
-        on = {
-            "residual": True,
-            "directions": len(shape.angles) > 0,
-            "leakage": shape.constant,
-            "direct": shape.direct,
-            "mirrors": len(shape.sequences) > 0,
-            "drift": shape.correlated,
-        }
-        return tuple(name for name, is_on in on.items() if is_on)
+        return tuple(term.name for term in self.prior.terms if term.name)
 
     def objects(self) -> SiteObjects:
         """The mirror planes that static ends share."""
-        planes = self.values.planes.numpy()
-        return SiteObjects.of(planes=planes if len(planes) else None)
+        images = self.prior.get(Images)
+        return SiteObjects.of(planes=None if images is None else images.planes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; factors of runs are estimated by likelihood where there are several.
@@ -164,22 +140,18 @@ class ChannelField(ClosedForm, kind="diffuse"):
 
     def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
-        values = self.values
-        all_factors = [Factor.of(covariance) for covariance in _covariances(groups, values)]
-        if factors is None:
-            factors = run_factors_of(groups, all_factors, len(runs))
+        prior = self.prior
+        both = zip(prior.of_groups(groups), groups, strict=True)
+        covariances = [signal + prior.disturbance(group) for signal, group in both]
+        factors, told = aligned(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
-        weights, noise = [], float(values.of("noise"))
-        for group, factor in zip(groups, all_factors, strict=True):
-            aligned = replace(group, target=group.target / factors[group.run][:, None])
-            given = Conditioned(factor, aligned.target, factor.solved(aligned.target))
-            weights.append(Weights(aligned, given, max(given.scale, 1e-300), noise, values.is_real))
-        self.weights = tuple(weights)
+        rest = prior.noise, prior.is_real
+        self.weights = tuple(Weights(group, given, max(given.scale, 1e-300), *rest) for group, given in told)
         self.stations = {}
-        for known in weights:
+        for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
-        heard = [(known.group, known.given.weights, known.scale) for known in weights]
-        self.common = Common.of(values, heard) if len(self.stations) > 1 else None
+        heard = [(known.group, known.given.weights, known.scale) for known in self.weights]
+        self.common = Common.of(prior, heard) if len(self.stations) > 1 else None
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
@@ -187,14 +159,14 @@ class ChannelField(ClosedForm, kind="diffuse"):
         Without stations those at the static places are asked, the first of several at one. Of one that no
         row was learned of, what ends have in common answers (`Common`).
         """
+        longest = max(len(each.group) for each in self._conditioned())
         moving, static, turned, station = query_ends(self.site, query.tx, query.rx)
         if query.station is not None and self.site.stations is not None:
             station = query.station.cpu()
         dtype, device = query.tx.dtype, query.tx.device
-        count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
             self._answer(moving[part], static[part], turned[part], station[part], dtype)
-            for part in torch.arange(count).split(max(CHUNK // longest, 1))
+            for part in torch.arange(len(moving)).split(max(CHUNK // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
@@ -209,87 +181,64 @@ class ChannelField(ClosedForm, kind="diffuse"):
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
-        values, size = self.values, math.prod(self.channel)
+        prior, images, size = self.prior, self.prior.get(Images), math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
-        share = torch.zeros_like(mean) if self.size() else mean
+        share = mean if images is None else torch.zeros_like(mean)
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
-        disturbed = sum(values.of(name).sum() for name in ("noise", "fast", "drift"))
+
+        def tell(slot: Slot, here: Tensor, said: Tensor, left: Tensor, whole: Tensor) -> None:
+            slot.put(mean, here, said)
+            for total, part in ((after, left), (before, whole)):
+                total.index_add_(0, here, part * (said.shape[1] / size))
+
         for alike in self._by_places(moving, turned, station):
-            slots, places, learned = (
-                [one.group.slot for one, _, _ in alike],
-                alike[0][2],
-                alike[0][0].group.places,
-            )
-            powers = directional(values, slots)
-            fields = diffuse_of(values, slots[0].wavenumber, powers, places, learned)
-            for number, (known, here, _) in enumerate(alike):
-                slot = slots[number]
-                cross = fields[min(number, len(fields) - 1)] + specular(values, slot, places, learned)
-                slot.put(mean, here, known.given.mean(cross))
-                if self.size():
-                    slot.put(share, here, known.given.mean(explained(values, slot, places, learned)))
+            asked = [At(known.group.slot, places) for known, _, places in alike]
+            crosses = prior.together(asked, [known.group for known, _, _ in alike])
+            for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
+                if images is not None:
+                    at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
                 removed = known.given.known(cross) if exact else known.learned(cross)
-                weight = known.scale * known.group.target.shape[1] / size
-                whole = prior(values, slot, places) + disturbed
-                after.index_add_(0, here, weight * (whole - removed).clamp_min(0))
-                before.index_add_(0, here, weight * whole)
+                whole = prior.variance(at) + prior.disturbed
+                left = known.scale * (whole - removed).clamp_min(0)
+                tell(at.slot, here, known.given.mean(cross), left, known.scale * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (static == place).all(1)).flatten()
-            self._of_unheard(place, here, moving, turned, mean, after, before)
+            assert self.common is not None
+            for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
+                slot, outputs = known.group.slot, known.group.target.shape[1]
+                slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
+                at = At(slot, slot.places(moving[here], turned[here]))
+                common, left, whole = self.common.at(prior, at)
+                tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 
     def _by_places(
         self, moving: Tensor, turned: Tensor, station: Tensor
     ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
-        by_places: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
+        alike: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
         for number in station.unique().tolist():
             here = torch.nonzero(station == number).flatten()
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
                 places = slot.places(moving[here], turned[here])
-                first = numbers(learned.places)[0].tobytes()
-                queried = numbers(places).tobytes()
-                key = (slot.wavenumber, learned.displacements, first, queried)
-                by_places.setdefault(key, []).append((known, here, places))
-        return list(by_places.values())
-
-    def _of_unheard(
-        self,
-        place: Tensor,
-        here: Tensor,
-        moving: Tensor,
-        turned: Tensor,
-        mean: Tensor,
-        after: Tensor,
-        before: Tensor,
-    ) -> None:
-        """Write what ends have in common for queries `here` of a static end at `place` (3,)."""
-        assert self.common is not None
-        size, values = math.prod(self.channel), self.values
-        for template in next(iter(self.stations.values())):
-            slot = template.group.slot
-            slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
-            places = slot.places(moving[here], turned[here])
-            common, variance, prior_variance = self.common.at(values, slot, places)
-            outputs = template.group.target.shape[1]
-            slot.put(mean, here, common[:, None].expand(-1, outputs))
-            after.index_add_(0, here, variance * outputs / size)
-            before.index_add_(0, here, prior_variance * outputs / size)
+                here_and_there = (numbers(one).tobytes() for one in (places, learned.places[:1]))
+                key = slot.wavenumber, learned.displacements, *here_and_there
+                alike.setdefault(key, []).append((known, here, places))
+        return list(alike.values())
 
     def left_out(self) -> LeftOutRows:
         """See `ClosedForm`; in the phase and level of each row's own run.
 
         What rows have in common by their order alone is not predicted: no query has it.
         """
-        values = self.values
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
         for known in self._conditioned():
             group, outputs = known.group, known.group.target.shape[1]
-            other = disturbance(values, group).to(torch.complex128)
+            other = self.prior.disturbance(group).to(torch.complex128)
             residual, error = known.given.left_out_signal(other)
             assert error is not None
             predicted = group.target - residual
@@ -308,45 +257,17 @@ class ChannelField(ClosedForm, kind="diffuse"):
         """See `Method.state`; factors are computed again by `restore`."""
         groups = [each.group for each in self._conditioned()]
         return {
-            "shape": self.values.state(),
-            "values": {name: getattr(self.values, name) for name in NUMBERS},
+            "prior": self.prior.state(),
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
             **self.runs.state(),
-            "groups": [
-                {
-                    **{one.name: getattr(group, one.name) for one in fields(group)},
-                    "slot": _slot_state(group.slot),
-                    "target": group.target * self.runs.factors[group.run][:, None],
-                }
-                for group in groups
-            ],
+            "groups": [group.state(self.runs.factors) for group in groups],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        shape, antennas_tones = dict(state["shape"]), [int(n) for n in state["channel"]]
-        shape["sequences"] = tuple(tuple(int(i) for i in sequence) for sequence in shape["sequences"])
-        self.site, self.channel = site, (antennas_tones[0], antennas_tones[1])
-        self.values, self.rows = Values(**shape, **state["values"]), state["rows"].numpy()
+        antennas, tones = (int(n) for n in state["channel"])
+        self.site, self.channel = site, (antennas, tones)
+        self.prior, self.rows = ChannelPrior.read(state["prior"]), state["rows"].numpy()
         runs = RunFactors.read(state)
-        groups = tuple(Group(**{**each, "slot": _read(each["slot"])}) for each in state["groups"])
-        self._solve(groups, runs.runs, runs.factors)
-
-
-def _covariances(groups: tuple[Group, ...], values: Values) -> list[Tensor]:
-    """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
-    both = zip(signals(groups, values), groups, strict=True)
-    return [signal + disturbance(values, group) for signal, group in both]
-
-
-def _slot_state(slot: Slot) -> dict[str, Any]:
-    """What `_read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
-    unknown = bool(slot.end.isnan().any())
-    return {**vars(slot), "end": slot.end[:0] if unknown else slot.end}
-
-
-def _read(state: dict[str, Any]) -> Slot:
-    end = state["end"] if len(state["end"]) else torch.full((3,), torch.nan, dtype=torch.float64)
-    entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
-    return Slot(**{**state, **entries, "end": end})
+        self._solve(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.covariance import Values, image_waves
 from gsparc.models.channels.evidence import Compressed
+from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe, summed_gains
-from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.models.channels.terms import Images
+from gsparc.models.channels.terms.term import Frame
 from gsparc.processes.worker import raise_if_cancelled
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
@@ -40,16 +40,10 @@ Probes = tuple[Probe, ...]
 class _Searcher:
     """Planes that are kept, and probes of few rows of few ends (`rough`) and of all with them."""
 
-    def __init__(self, rough: Probes, probes: Probes, values: Values, wavelength: float) -> None:
-        self.rough, self.probes, self.wavelength = rough, probes, wavelength
-        self.values = values
-        self.ends = torch.stack([probe.group.slot.end for probe in probes]) + values.offset
-        self.planes, self.risen = values.planes[:0], 0.0
-
-    def waves(self, probe: Probe, planes: Tensor) -> Tensor:
-        """(W, n) of the images in planes (W, 4)."""
-        values = replace(self.values, sequences=_each(planes), planes=planes)
-        return image_waves(values, probe.group.slot, probe.group.places)
+    def __init__(self, rough: Probes, probes: Probes, frame: Frame, wavelength: float) -> None:
+        self.rough, self.probes, self.frame, self.wavelength = rough, probes, frame, wavelength
+        self.ends = torch.stack([probe.group.slot.end for probe in probes])
+        self.planes, self.risen = torch.zeros(0, 4, dtype=torch.float64), 0.0
 
     def gains(
         self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.known
@@ -57,15 +51,16 @@ class _Searcher:
         """Rise of the log likelihood (W, levels) of each plane alone."""
 
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
-            return self.waves(probe, planes[chunk])
+            return Images.of(self.frame, planes[chunk]).waves(probe.group)
 
         return summed_gains(probes, len(planes), waves, LEVELS, known)
 
     def keep(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""
         self.planes, self.risen = torch.cat([self.planes, plane[None]]), self.risen + gain
+        image = Images.of(self.frame, plane[None])
         self.rough, self.probes = (
-            tuple(probe.added(self.waves(probe, plane[None])[0], level) for probe in each)
+            tuple(probe.added(image.waves(probe.group)[0], level) for probe in each)
             for each in (self.rough, self.probes)
         )
 
@@ -73,8 +68,8 @@ class _Searcher:
         """The best planes whose images of the ends are apart."""
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
-            planes = torch.stack([*chosen, grid[number]])
-            placed = images(self.ends, planes, list(_each(planes)))
+            tried = Images.of(self.frame, torch.stack([*chosen, grid[number]]))
+            placed = tried.placed(self.ends)
             away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
             if not bool((away < APART * self.wavelength).any()):
                 chosen.append(grid[number])
@@ -84,7 +79,7 @@ class _Searcher:
 
     def moved(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
-        middle, shift = self.values.middle, STEP * self.wavelength / 2
+        middle, shift = self.frame.middle, STEP * self.wavelength / 2
         across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 0.0, 1.0]).double())
         if float(across.norm()) < 0.5:
             across = torch.tensor([1.0, 0.0, 0.0]).double()
@@ -105,26 +100,23 @@ class _Searcher:
 
 
 def find_mirrors(
-    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], values: Values,
+    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], prior: ChannelPrior,
     wavelength: float, most: int,
-) -> tuple[Tensor, tuple[Reflections, ...]]:  # fmt: skip
-    """Planes (W, 4) float64, local, and an image in each; none where all together are not worth it.
+) -> Tensor:  # fmt: skip
+    """Planes (W, 4) float64, local; none where all together are not worth it.
 
     Args:
         coarse: few rows of few ends, for the grid.
         parts: of all ends.
-        values: the terms beside.
+        prior: the terms beside.
         wavelength: [m].
         most: planes.
     """
-    rough, probes = (
-        tuple(Probe.of(part, part.own(values.power, values.towards)) for part in each)
-        for each in (coarse, parts)
-    )
-    search = _Searcher(rough, probes, values, wavelength)
+    rough, probes = (tuple(Probe.of(part, prior) for part in each) for each in (coarse, parts))
+    search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidates(rough, values, wavelength)
+    grid, turn = candidates(rough, prior.frame, wavelength)
     while len(search.planes) < most:
         raise_if_cancelled()
         scores = search.gains(search.rough, grid, _about).max(1).values
@@ -136,14 +128,13 @@ def find_mirrors(
         if gain < PARAMETERS * worth:
             break
         search.keep(plane, level, gain)
-    worth_it = 2 * search.risen > LEAST * numbers
-    return (search.planes, _each(search.planes)) if worth_it else (search.planes[:0], ())
+    return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
-def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tensor, float]:
+def candidates(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
     """Upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
-    points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + values.offset])
+    points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])
     extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))
     count = min(max(math.ceil(2 * math.pi**2 * extent / wavelength / TURN_RAD), 4), MOST_TURNS)
     azimuth = torch.arange(4 * math.ceil(count / 4), dtype=torch.float64)
@@ -155,13 +146,9 @@ def candidates(probes: Probes, values: Values, wavelength: float) -> tuple[Tenso
         margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
         number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
         offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
-        offsets = offsets[(offsets - values.middle @ normal).abs() > STEP * wavelength]
+        offsets = offsets[(offsets - frame.middle @ normal).abs() > STEP * wavelength]
         planes.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
     return torch.cat(planes), turn
-
-
-def _each(planes: Tensor) -> tuple[Reflections, ...]:
-    return tuple((number,) for number in range(len(planes)))
 
 
 def _about(probe: Probe, waves: Tensor) -> Tensor:

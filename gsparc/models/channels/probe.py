@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.covariance import Values, direct_wave
 from gsparc.models.channels.evidence import Compressed, solved
+from gsparc.models.channels.prior import ChannelPrior
+from gsparc.models.channels.terms import Direct
 from gsparc.processes.factor import Factor
 
 CHUNK = 300_000  # entries of waves held at a time
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
 REFINED = 3  # halvings of the step
+NONE = 1e-12  # power of a wave that is left out
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,9 @@ class Probe:
     scale: float
 
     @staticmethod
-    def of(part: Compressed, power: Tensor) -> Probe:
-        """With the group's own powers (P,)."""
-        at, basis = solved(part, power), part.basis.to(torch.complex128)
-        noise = float(power[len(part.room) + len(part.terms)])
+    def of(part: Compressed, prior: ChannelPrior) -> Probe:
+        """With the group's own powers."""
+        at, basis, noise = solved(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
@@ -91,34 +92,28 @@ def summed_gains(
     return total
 
 
-def best_offset(parts: tuple[Compressed, ...], values: Values, wavelength: float) -> Tensor | None:
+def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
     """The offset (3,) float64 [m] of largest likelihood on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
-    power, level = values.power.clone(), float(values.of("direct").sum() + values.of("direct_smooth").sum())
-    for number, name in enumerate(values.names):
-        if name in ("direct", "direct_smooth"):
-            power[number] = 1e-12
-    probes = [Probe.of(part, power) for part in parts]
+    direct = prior[Direct]
+    none = prior.changed(replace(direct, power=torch.full_like(direct.power, NONE)))
+    probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
-            moved = (replace(values, offset=offset) for offset in offsets[chunk])
-            return torch.stack([direct_wave(at, probe.group.slot, probe.group.places) for at in moved])
+            moved = (replace(direct, frame=replace(direct.frame, offset=offset)) for offset in offsets[chunk])
+            return torch.cat([at.waves(probe.group) for at in moved])
 
-        prior = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        return prior + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
+        likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
+        return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
 
-    step = REACH * wavelength / COARSE
-    axis = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64) * step
-    best = torch.zeros(3, dtype=torch.float64)
-    grid = torch.cartesian_prod(axis, axis, axis)
-    for _ in range(1 + REFINED):
-        score = gain(best + grid)
-        best = best + grid[score.argmax()]
-        step = step / 2
-        near = torch.tensor([-step, 0.0, step], dtype=torch.float64)
-        grid = torch.cartesian_prod(near, near, near)
-    none, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
-    return best if math.isfinite(best_gain) and best_gain > none else None
+    best, step = torch.zeros(3, dtype=torch.float64), REACH * wavelength / COARSE
+    near = torch.arange(-1, 2, dtype=torch.float64)
+    coarse = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64)
+    for axis in (coarse, *(near / 2**halving for halving in range(1, REFINED + 1))):
+        grid = best + step * torch.cartesian_prod(axis, axis, axis)
+        best = grid[gain(grid).argmax()]
+    unmoved, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
+    return best if math.isfinite(best_gain) and best_gain > unmoved else None

@@ -25,7 +25,6 @@ from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
 
@@ -136,7 +135,7 @@ class PositionRefinement:
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
 
-    def _total(self, without: int | None = None) -> Tensor:
+    def total(self, without: int | None = None) -> Tensor:
         """Covariance (n, n) of the rows by all sources but one."""
         power = self.power.to(self.terms.dtype)
         if without is not None:  # a difference of covariances need not be positive definite
@@ -147,7 +146,7 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            given = with_noise(self._total(), self.noise, self.rows.target)
+            given = with_noise(self.total(), self.noise, self.rows.target)
             explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
             due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(1e-12)).clamp(1 / MAX_RATIO, MAX_RATIO)
@@ -158,9 +157,7 @@ class PositionRefinement:
 
     def _refine(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""
-        conditional = ConditionalLikelihood.of(
-            self, k, with_noise(self._total(without=k), self.noise, self.rows.target)
-        )
+        conditional = ConditionalLikelihood(self, k)
         if self.resolved[k]:
             places = self.current.points[k][None]
         else:
@@ -188,9 +185,8 @@ class PositionRefinement:
         return self.prior.points[k] + draw @ self.prior.lower[k].T
 
 
-@dataclass(frozen=True)
 class ConditionalLikelihood:
-    """Likelihood of one source's position given all others, at the n rows that see it.
+    """Likelihood of the position of source k given all others, at the n rows that see it.
 
     Attributes:
         rows: these.
@@ -200,25 +196,14 @@ class ConditionalLikelihood:
         centre, precision: mean (3,) [m] and inverse covariance (3, 3) of its prior.
     """
 
-    rows: Rows
-    inverse: Tensor
-    alpha: Tensor
-    power: float
-    centre: Tensor
-    precision: Tensor
-
-    @staticmethod
-    def of(refinement: PositionRefinement, k: int, given: Conditioned) -> ConditionalLikelihood:
-        """Of source k, with the factor of the covariance without it."""
-        rows_in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
-        return ConditionalLikelihood(
-            refinement.rows.take(rows_in_view),
-            given.factor.inverse[rows_in_view[:, None], rows_in_view],
-            given.weights[rows_in_view],
-            float(refinement.power[k]),
-            refinement.prior.points[k],
-            torch.linalg.inv(refinement.prior.covariance[k]),
-        )
+    def __init__(self, refinement: PositionRefinement, k: int) -> None:
+        rows, prior = refinement.rows, refinement.prior
+        given = with_noise(refinement.total(without=k), refinement.noise, rows.target)
+        in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
+        self.rows, self.alpha = rows.take(in_view), given.weights[in_view]
+        self.inverse = given.factor.inverse[in_view[:, None], in_view]
+        self.power, self.centre = float(refinement.power[k]), prior.points[k]
+        self.precision = torch.linalg.inv(prior.covariance[k])
 
     def log_posterior(self, points: Tensor) -> Tensor:
         """Log posterior (m,) float64 of places (m, 3), up to a constant."""

@@ -193,7 +193,7 @@ def _distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
     """Sigma [rad] of the rays of the point of largest evidence, or None without one."""
-    best: tuple[float, float] | None = None
+    found: list[tuple[float, float]] = []
     if len(rays) > ERROR_SAMPLE:
         rays = rays.take(np.sort(rng.choice(len(rays), ERROR_SAMPLE, replace=False)))
     for error in ERRORS:
@@ -203,9 +203,9 @@ def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
         squared_error = rays.squared_error(proposed)
         top = int(np.maximum(_gain(squared_error, error), 0).sum(1).argmax())
         evidence = _refined(rays, proposed[top], error)[1]
-        if evidence > MIN_EVIDENCE and (best is None or evidence > best[0]):
-            best = evidence, error
-    return None if best is None else best[1]
+        if evidence > MIN_EVIDENCE:
+            found.append((evidence, error))
+    return max(found)[1] if found else None
 
 
 def _refined(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarray, float]:

@@ -15,10 +15,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT, NEAR_M
-from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.worker import raise_if_cancelled
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
@@ -30,16 +30,12 @@ STEPS, STEP_M = 25, 0.02  # of the ascent
 Spread = Callable[[Tensor], Tensor]
 
 
-def score(rows: Rows, candidates: Tensor, conditioned: Conditioned) -> tuple[Tensor, Tensor]:
+def score(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
     """
-    return score_waves(steering(rows, candidates), conditioned)
-
-
-def score_waves(waves: Tensor, conditioned: Conditioned) -> tuple[Tensor, Tensor]:
-    """The same of any waves (n, m) complex64."""
+    waves, conditioned = steering(posterior.rows, candidates), posterior.conditioned
     matched = (waves.mH @ conditioned.weights).abs().square().sum(1)
     power = (conditioned.factor.root @ waves).abs().square().sum(0)
     gained = matched / power
@@ -80,14 +76,9 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 
 def search_box(
-    rows: Rows,
-    conditioned: Conditioned,
-    box: Tensor,
-    min_distance: float,
-    limit: int,
-    generator: torch.Generator,
+    posterior: Posterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
     spread: Spread,
-) -> list[tuple[Tensor, Tensor, Tensor]]:
+) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
@@ -95,34 +86,34 @@ def search_box(
     """
     share = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
     candidates = box[0] + (box[1] - box[0]) * share
-    rough = quick_score(rows, spread(candidates), conditioned.weights)
+    rough = quick_score(posterior.rows, spread(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([score(rows, spread(part), conditioned)[0] for part in candidates.split(512)])
+    exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(512)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
-    rates = [STEP_M * (1 - 0.8 * step / STEPS) for step in range(STEPS)]
-    (polished,) = ascend([best], lambda position: score(rows, spread(position), conditioned)[0], rates)
-    scores, amplitude = score(rows, spread(polished), conditioned)
+    polished = best.clone().requires_grad_()
+    optimizer = torch.optim.Adam([polished], betas=(0.8, 0.95))
+    for step in range(STEPS):  # each to its own maximum, as the score's logarithms are summed
+        raise_if_cancelled()
+        optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)
+        optimizer.zero_grad()
+        (-score(posterior, spread(polished))[0].log().sum()).backward()
+        optimizer.step()
+    polished = polished.detach()
+    scores, amplitude = score(posterior, spread(polished))
     chosen = pick_apart(polished, scores, min_distance, limit)
     return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
 
 
-def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[float]) -> list[Tensor]:
-    """Values (m, ...) after steps of Adam of `rates` on the sum of log scores, each to its own maximum."""
-    leaves = [value.clone().requires_grad_() for value in values]
-    optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
-    for rate in rates:
-        raise_if_cancelled()
-        optimizer.param_groups[0]["lr"] = rate
-        optimizer.zero_grad()
-        (-scores(*leaves).log().sum()).backward()
-        optimizer.step()
-    return [leaf.detach() for leaf in leaves]
-
-
 def pick_apart(
-    position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0
-) -> list[int]:
-    """Indices of the best scores (n,) of at least `threshold`, positions (n, 3) `min_distance` [m] apart."""
+    position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0,
+    known: Tensor | None = None,
+) -> list[int]:  # fmt: skip
+    """Indices of the best scores (n,) of at least `threshold`, positions (n, 3) `min_distance` [m] apart.
+
+    Also from those that are `known` (K, 3).
+    """
+    if known is not None:
+        scores = scores * (torch.cdist(position, known).amin(1) > min_distance)
     chosen: list[int] = []
     for i in scores.argsort(descending=True).tolist():
         if scores[i] < threshold or len(chosen) == limit:

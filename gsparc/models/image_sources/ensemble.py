@@ -18,7 +18,7 @@ from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
@@ -39,10 +39,8 @@ def search_many(
     row_sets: list[Rows],
     transmitter: Tensor,
     settings: SearchSettings,
-    seed: int,
     noise_floor: float,
     budget: TimeBudget,
-    clutter: bool,
     cache: SearchCache,
     look: Look | None = None,
 ) -> list[Member]:
@@ -55,10 +53,8 @@ def search_many(
         row_sets: rows of each search, unit mean power, about the middle of the scene.
         transmitter: (3,) float64 [m], in the same frame.
         settings: of every search.
-        seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: effort of each, and what ends all together.
-        clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches.
         look: at the first search after each of its rounds, and after the last.
 
@@ -88,21 +84,20 @@ def search_many(
                 look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor), False)
             return ended()
 
-        search = Search(rows, transmitter, settings, seed + number, last_round)
+        search = Search(rows, transmitter, settings, number, last_round)
         scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
-        scene = refine(rows, learn_visibility(rows, scene, 10, settings.visibility), 20)
+        scene = refine(rows, learn_visibility(rows, scene, 10, KernelVisibility()), 20)
         if look is not None and number == 0:
             look(rows, scene, True)
         error = left_out_error(rows, scene)
         hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
-        if clutter and not hidden and compact(rows):
-            generator = torch.Generator().manual_seed(seed + number)
-            scene = find_clutter(rows, scene, generator)
+        if settings.clutter and not hidden and compact(rows):
+            scene = find_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
             error = left_out_error(rows, scene)
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if member := cache.find(number, noise_floor):
+        if member := cache.find(number):
             errors[number] = member.left_out
             return member
         if unwanted(number) or (number > 0 and budget.over()):
@@ -169,7 +164,7 @@ def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
 
 
-def ensemble_weights(members: list[Member]) -> Tensor:
+def weights_of(members: list[Member]) -> Tensor:
     """Weights of the searches in the average, (M,) float32 of sum 1."""
     error = torch.tensor([max(member.left_out, 1e-6) for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,8 +13,8 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.closed_form import LeftOutRows
-from gsparc.models.image_sources.rows import Rows, query_elements, static_array
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.image_sources.rows import Rows, channel_places, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 
@@ -62,32 +63,11 @@ class Frame:
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        if self.site.moving_end == "rx":
-            places = query_elements(self.site, query.rx, len(query), self.antennas)
-            return places.reshape(-1, 3) - self.middle, len(places)
-        places = query.tx.cpu().double() - self.middle
-        array = static_array(self.site, self.antennas)
-        if array is None:
-            return places, len(places)
-        each = torch.repeat_interleave(places, len(array), 0)
-        return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
-
-    def stored(self, mean: Tensor, tones: Tensor) -> Tensor:
-        """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
-        tone_scale = (self.carrier_hz / tones).float()
-        return (mean * (tone_scale * self.scale)).reshape(-1, self.antennas, len(tones))
-
-    def prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
-        """Of the mean (B, A, K), all of it by sources, and squared error and power (B E,), normalised."""
-        variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
-        return Prediction(mean, variance * self.scale**2, (variance / prior).clamp(0, 1), mean)
-
-    def paths(self, gain: Tensor, away: Tensor, towards: Tensor) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `ImageSourceGP.paths`; of gains (B E, R, N), ranges (B E, N) [m], offsets (B, N, 3) [m]."""
-        count = len(towards)
-        gain = (gain * self.scale).reshape(count, self.antennas, -1)
-        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), self.carrier_hz
+        rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
+        position = query.rx.position if self.site.moving_end == "rx" else query.tx
+        position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
+        places = channel_places(self.site, self.antennas, position, rotation)
+        return places.flatten(0, 1), len(query)
 
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
@@ -95,15 +75,69 @@ class Frame:
         unknown = torch.full((len(predicted),), float("nan"))
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
-    def state(self, rows: Rows) -> dict[str, Any]:
-        """What `read` reads, with the rows in the frame."""
-        numbers = [self.middle, self.scale, self.carrier_hz]
-        return {"antennas": self.antennas, "frame": numbers, "rows": [*vars(rows).values()]}
+    def state(self) -> dict[str, Any]:
+        """What makes it again, of the same site."""
+        return {name: value for name, value in vars(self).items() if name != "site"}
 
-    @staticmethod
-    def read(site: Site, state: dict[str, Any]) -> tuple[Frame, Rows]:
-        """Inverse of `state`."""
-        return Frame(site, int(state["antennas"]), *state["frame"]), Rows(*state["rows"])
+
+class SourcesInFrame(ClosedForm):
+    """Channels as sums of sources that a search proposes.
+
+    Attributes:
+        frame: of the fit.
+        factors: (A,) complex64, what each antenna's channels were multiplied by before the fit; (1,) of all.
+    """
+
+    frame: Frame
+    factors = torch.ones(1, dtype=torch.complex64)
+
+    @abstractmethod
+    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
+
+        Normalised; the prior is the power that is expected without any rows.
+        """
+
+    @abstractmethod
+    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gains (m, R, N) at the carrier, normalised, ranges (m, N) and sources (N, 3) [m]."""
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`.
+
+        The variance is of gains, noise, visibility and between searches; the confidence is the explained
+        share of the expected power.
+        """
+        frame = self._fitted()
+        places, count = frame.places(query)
+        tones = torch.from_numpy(frame.site.tones())
+        mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
+        mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
+        mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
+        variance, prior = (each.reshape(count, -1).mean(1) for each in (variance, prior))
+        return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
+
+    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+        """The paths that `predict` sums, one per source: of several searches, with the search's weight.
+
+        Returns:
+            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
+            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
+            the carrier [Hz].
+        """
+        frame = self._fitted()
+        places, count = frame.places(query)
+        gain, away, sources = self._paths(places)
+        gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
+        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
+        towards = sources - places[:, :3].reshape(count, -1, 3).mean(1)[:, None]
+        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, unit, frame.carrier_hz
+
+    def _fitted(self) -> Frame:
+        if self.site is None or not self.size():
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.frame
 
 
 def refuse(site: Site, name: str) -> None:

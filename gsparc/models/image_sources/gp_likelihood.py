@@ -151,7 +151,8 @@ class Posterior:
         return PhasedGains(self.rows, self.scene.quadrature)
 
     @cached_property
-    def _summed(self) -> CircularGains:
+    def summed(self) -> CircularGains:
+        """Of all sources, without noise until it is `given`."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
@@ -160,13 +161,13 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self._summed.given(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
+        return self.summed.given(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
 
     @property
     def covariance(self) -> Tensor:
         """Of the rows, noise included."""
         assert self.conditioned
-        return self._summed.matrix
+        return self.summed.matrix
 
     @property
     def nll(self) -> float:

@@ -15,38 +15,23 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import identity
-from gsparc.data.query import Query
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
-from gsparc.models.image_sources.ensemble import (
-    Look,
-    at_noise_floor,
-    ensemble_weights,
-    raced,
-    refined,
-    search_many,
-)
-from gsparc.models.image_sources.frame import Frame, refuse, refuse_turning
+from gsparc.models.image_sources.ensemble import Look, at_noise_floor, raced, refined, search_many, weights_of
+from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.phase_offsets import KINDS, Offsets, estimate
+from gsparc.models.image_sources.phase_offsets import Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
-from gsparc.models.image_sources.rows import (
-    Rows,
-    box_of,
-    gather,
-    measured_places,
-    ranges_at,
-    scatterers,
-    static_array,
-)
+from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
+from gsparc.models.plain import made, plain
 from gsparc.models.reduced import MeanOnly
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
@@ -61,54 +46,34 @@ LOOKED_AT = 200  # rows of the group that a search leaves out, after each round
 ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
 
 
-class ImageSourceGP(ClosedForm, kind="sources"):
+class ImageSourceGP(SourcesInFrame, kind="sources"):
     """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
-        searches: how many, with different seeds; their predictions are averaged.
         budget_s: as `FitContext.budget_s`, where that says nothing [s].
-        search_rows: receivers times tones of a search.
-        rows: receivers times tones of the final process.
-        margin, max_sources, order: see `SearchSettings`.
-        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
-        clutter: search for occluding boxes and finite mirrors, shared by all sources.
-        seed: of everything random.
+        searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see `SearchSettings`.
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
     Raises:
-        ValueError: the data are not channels, or their phase means nothing.
+        SettingError: a setting that cannot be.
     """
 
     name = "image_source_gp"
+    members: tuple[Posterior, ...] = ()
     _groups: tuple[np.ndarray, ...] = ()
     resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
 
     def __init__(
-        self,
-        searches: int = 6,
-        budget_s: float | None = None,
-        search_rows: int = 700,
-        rows: int = 3000,
-        margin: float = 8.0,
-        max_sources: int = 60,
-        order: int = 3,
-        offsets: Offsets = "none",
-        clutter: bool = True,
-        seed: int = 0,
-    ) -> None:
-        if offsets not in KINDS:
-            raise ValueError(f"{self.name}: offsets={offsets!r} is none of {', '.join(KINDS)}")
-        if searches < 1:
-            raise ValueError(f"{self.name}: searches must be at least 1, got {searches}")
-        if search_rows < 8 or rows < 8:
-            raise ValueError(f"{self.name}: search_rows={search_rows}, rows={rows}: at least 8 are needed")
-        self.searches, self.budget_s, self.seed = searches, budget_s, seed
-        self.offsets, self.clutter = offsets, clutter
-        self.search_rows, self.row_limit = search_rows, rows
-        self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
-        self.members: list[Posterior] = []
+        self, searches: int = 6, budget_s: float | None = None, search_rows: int = 700, rows: int = 3000,
+        margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Offsets = "none",
+        clutter: bool = True, seed: int = 0,
+    ) -> None:  # fmt: skip
+        self.budget_s, self.settings = (
+            budget_s,
+            SearchSettings(searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed),
+        )
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood.
@@ -130,40 +95,38 @@ class ImageSourceGP(ClosedForm, kind="sources"):
     def _fit(
         self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
     ) -> FitReport:
-        if context.budget_s is None:
-            context = replace(context, budget_s=self.budget_s)
-        if not context.leave_out:
-            context = replace(context, effort=ALONE * context.effort)
-        budget = context.time_budget(cache.spent)
+        budget_s = self.budget_s if context.budget_s is None else context.budget_s
+        effort = context.effort * (1.0 if context.leave_out else ALONE)
+        context = replace(context, budget_s=budget_s, effort=effort)
+        budget, settings = context.time_budget(cache.spent), self.settings
         self.site, antennas = data.site, data.target.shape[1]
-        self.frame = Frame.of(data.site, antennas, gather(data, known, self.row_limit, self.seed))
-        noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
-        self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
+        self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
+        noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
+        self.noise_floor = max(1e-5, noise / self.frame.scale**2)
         notes: list[str] = []
         self.factors = torch.ones(antennas, dtype=torch.complex64)
-        calibrated = static_array(data.site, antennas) is not None and self.offsets == "none"
+        calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
-            start = self._row_sets(data, known, 1)[0]
+            start = self._searched_rows(data, known, 0)
             data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
-        if self.offsets != "none":
+        if settings.offsets != "none":
             data = self._without_offsets(data, known, budget)
             notes.append(
-                f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
+                f"{self.name}: {settings.offsets} offset of every snapshot estimated; predictions have none"
             )
-        row_sets = self._row_sets(data, known, self.searches)
+        row_sets = self._row_sets(data, known)
         look = None
         if self._groups and context.race is not None:
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = raced(context.race, group, partial(self._missed, data.batch(group)))
-        members = self._search(row_sets, self.settings, budget, self.clutter, cache, look)
+        members = self._search(row_sets, settings, budget, cache, look)
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
-                data, row_sets = again, self._row_sets(again, known, self.searches)
+                data, row_sets = again, self._row_sets(again, known)
                 members = [refined(row_sets[one.number], one) for one in members]
-        self.weights = ensemble_weights(members)
-        rows = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-        self._conditioned(rows, [member.scene for member in members])
+        rows = self._rows(data, known)
+        self._become(rows, members)
         self.held = self._left_out_rows(data, known, members, len(rows))
         notes += self._described(members, budget)
         limited = less_repeatable(budget.limited_by, cache.limited_by)
@@ -171,29 +134,29 @@ class ImageSourceGP(ClosedForm, kind="sources"):
 
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
-        self.members = [Posterior(rows, scene) for scene in scenes]
+        self.members = tuple(Posterior(rows, scene) for scene in scenes)
         self.query = Means(self.members)
 
-    def _of(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
-        """What these members alone say."""
-        twin = copy.copy(self)
-        twin._conditioned(rows, [member.scene for member in members])
-        twin.weights = ensemble_weights(members)
-        return twin
+    def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
+        """Say what these members say, with their weights."""
+        self._conditioned(rows, [member.scene for member in members])
+        self.weights = weights_of(members)
+        return self
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
-        scene, notes = self.members[0].scene, []
+        scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
-        notes.append(f"{len(members)} of {self.searches} searches ({ended}), {counts} sources")
-        inside = int(scatterers(scene.sources, box_of(self.members[0].rows, scene.transmitter)).sum())
-        notes.append(f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers")
-        clutter = scene.clutter
-        if len(clutter):
-            boxes, patches = len(clutter.boxes), len(clutter.patches)
+        inside = int(scene.scatterers(self.members[0].rows).sum())
+        boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
+        notes = [
+            f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources",
+            f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers",
+        ]
+        if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
             turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
@@ -213,47 +176,52 @@ class ImageSourceGP(ClosedForm, kind="sources"):
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
-        settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
         rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
-        return {"data": identity(data), "rows": rows, "seed": str(self.seed), "settings": str(settings)}
+        settings = replace(self.settings, searches=1, seed=0)
+        seed = str(self.settings.seed)
+        return {"data": identity(data), "rows": rows, "seed": seed, "settings": str(settings)}
 
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
-        cache: SearchCache, look: Look | None = None,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
+        look: Look | None = None,
     ) -> list[Member]:  # fmt: skip
-        transmitter, floor = self._transmitter(), self.noise_floor
-        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, look)
+        return search_many(row_sets, self._transmitter(), settings, self.noise_floor, budget, cache, look)
 
     def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
         """What a search's scene misses (n, ...) of a batch that it left out."""
-        mean = self._of(rows, [Member(scene, 1.0)]).predict(batch).mean
+        mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         return mean - batch.target / self.factors[:, None]
 
-    def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
-        """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
-        parts = [gather(data, self._rows_of(known, i), self.search_rows, self.seed + i) for i in range(count)]
-        return [self.frame.inside(part) for part in parts]
+    def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
+        """Some rows in the frame, drawn with the seed of a search by its number."""
+        most = self.settings.rows if most is None else most
+        return self.frame.inside(gather(data, index, most, self.settings.seed + number))
 
-    def _rows_of(self, known: np.ndarray, number: int) -> np.ndarray:
-        """The rows of a search by its number."""
+    def _searched_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
+        """Rows of a search by its number."""
+        return self._rows(data, self._kept(known, number), self.settings.search_rows, number)
+
+    def _row_sets(self, data: Measurements, known: np.ndarray) -> list[Rows]:
+        """Rows of each search."""
+        return [self._searched_rows(data, known, number) for number in range(self.settings.searches)]
+
+    def _kept(self, known: np.ndarray, number: int) -> np.ndarray:
+        """What a search by its number learns from: all but the group whose turn it is."""
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
 
     def _left_out_rows(
-        self, data: Measurements, known: np.ndarray, all_members: list[Member], most: int
+        self, data: Measurements, known: np.ndarray, members: list[Member], most: int
     ) -> LeftOutRows | None:
         """Rows of every group predicted by the searches that left it out, from at most `most` others."""
-        if not self._groups:
-            return None
         rows, means = [], []
         for turn, group in enumerate(self._groups):
-            members = [one for one in all_members if one.number % len(self._groups) == turn]
-            if not members:
-                continue
-            apart = self.frame.inside(gather(data, self._rows_of(known, turn), most, self.seed))
-            batch = data.batch(group)
-            rows.append(group)
-            means.append(self._of(apart, members).predict(batch).mean)
+            if mine := [one for one in members if one.number % len(self._groups) == turn]:
+                apart = self._rows(data, self._kept(known, turn), most)
+                rows.append(group)
+                means.append(copy.copy(self)._become(apart, mine).predict(data.batch(group)).mean)
+        if not rows:
+            return None
         mean = torch.cat(means)
         return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
 
@@ -263,15 +231,14 @@ class ImageSourceGP(ClosedForm, kind="sources"):
 
     def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        direct = Scene(self._transmitter(), torch.zeros(0, 4).double(), ((),), torch.zeros(1), 0.0)
+        direct = Scene.direct(self._transmitter(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
-            few = replace(self.settings, max_sources=sources, final_steps=20)
-            rows = self._row_sets(aligned, known, 1)
-            scene = self._search(rows, few, budget, False, SearchCache())[0].scene
+            few = replace(self.settings, max_sources=sources, final_steps=20, clutter=False)
+            rows = self._searched_rows(aligned, known, 0)
+            scene = self._search([rows], few, budget, SearchCache())[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
-                rows = self._row_sets(aligned, known, 1)
-                gains = Posterior(rows[0], scene).mean_gains
+                gains = Posterior(self._searched_rows(aligned, known, 0), scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
@@ -279,8 +246,8 @@ class ImageSourceGP(ClosedForm, kind="sources"):
         self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
-        frequency = data.site.tones()
-        places = torch.from_numpy(measured_places(data, known).copy())
+        frequency, carrier = data.site.tones(), self.frame.carrier_hz
+        places = measured_places(data, known).clone()
         places[..., :3] -= self.frame.middle
         turned = orientations(scene.planes, scene.sequences)
         away = ranges_at(places.flatten(0, 1), scene.sources, turned)
@@ -289,47 +256,26 @@ class ImageSourceGP(ClosedForm, kind="sources"):
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
         predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
-        mask = None if data.mask is None else data.mask[known]
-        carrier = self.frame.carrier_hz
-        offsets = estimate(
-            data.target[known], predicted, frequency, carrier, self.offsets == "phase_timing", mask
-        )
+        mask, timing = None if data.mask is None else data.mask[known], self.settings.offsets != "phase"
+        offsets = estimate(data.target[known], predicted, frequency, carrier, timing, mask)
         target = data.target.copy()
         target[known] = offsets.removed(data.target[known], frequency, carrier)
         return replace(data, target=target)
 
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`.
-
-        The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
-        the expected power.
-        """
-        frame = self._fitted()
-        (flat, _), tones = frame.places(query), torch.from_numpy(frame.site.tones())
-        made = self.query.exact if query.tx.dtype == torch.float64 else self.query
-        stack, variance, prior = made.means(flat, tones)  # (members, B E, R, K)
+    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
+        stack, variance, prior = (self.query.exact if exact else self.query).means(places, tones)
         weight = self.weights[:, None, None, None]
-        mean = (weight * stack).sum(0)
-        variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        return frame.prediction(frame.stored(mean, tones) / self.factors[:, None], variance, prior)
+        mean = (weight * stack).sum(0)  # of (members, B E, R, K)
+        return mean, variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1), prior
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """The paths that `predict` sums: one per source of every search, with the search's weight.
-
-        Returns:
-            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
-            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
-            the carrier [Hz].
-        """
-        flat, count = self._fitted().places(query)
-        carrier = self.frame.carrier_hz
-        middle = flat[:, :3].reshape(count, -1, 3).mean(1)
+    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `SourcesInFrame`."""
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
-        away = self.query.pack.ranges(flat)
-        gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
-        towards = self.query.pack.sources - middle[:, None]
-        gains, delay, unit, carrier = self.frame.paths(gain.movedim(0, -1), away, towards)
-        return gains / self.factors[:, None], delay, unit, carrier
+        away = self.query.ranges(places)
+        gain = self.query.gains(places) * weight[:, None, None]
+        gain = gain * wave(away, self.frame.carrier_hz).T[..., None]
+        return gain.movedim(0, -1), away, self.query.sources
 
     def left_out(self) -> LeftOutRows:
         """Receivers, each predicted from all others."""
@@ -358,14 +304,11 @@ class ImageSourceGP(ClosedForm, kind="sources"):
         twin = copy.copy(self)
         count = min(int(settings.get("searches", len(self.members))), len(self.members))
         chosen = self.weights.topk(count).indices.sort().values
-        twin.members = [self.members[i] for i in chosen]
         twin.weights = self.weights[chosen] / self.weights[chosen].sum()
-        if "keep" in settings:
-            share = float(settings["keep"])
-            twin.members = [
-                _loudest(member, share, measured[f"contribution{i}"])
-                for member, i in zip(twin.members, chosen, strict=True)
-            ]
+        kept, share = {i: self.members[i] for i in chosen.tolist()}, settings.get("keep")
+        if share is not None:
+            kept = {i: _loudest(one, float(share), measured[f"contribution{i}"]) for i, one in kept.items()}
+        twin.members = tuple(kept.values())
         whole = settings.get("confidence", True)
         twin.query = Means(twin.members, VARIANCE_ROWS if whole else 0)
         return twin if whole else MeanOnly(twin)
@@ -373,24 +316,18 @@ class ImageSourceGP(ClosedForm, kind="sources"):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            **self._fitted().state(self.members[0].rows),
-            "weights": self.weights,
-            "noise_floor": self.noise_floor,
+            "frame": self._fitted().state(),
             "factors": self.factors,
-            "scenes": [member.scene.state() for member in self.members],
+            "weights": self.weights,
+            "rows": plain(self.members[0].rows),
+            "scenes": [plain(member.scene) for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, (self.frame, rows) = site, Frame.read(site, state)
-        self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
-        self.factors = state["factors"]
-        self._conditioned(rows, [Scene.from_state(stored, self.noise_floor) for stored in state["scenes"]])
-
-    def _fitted(self) -> Frame:
-        if self.site is None or not self.members:
-            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
-        return self.frame
+        self.site, self.frame = site, Frame(site, **state["frame"])
+        self.factors, self.weights = state["factors"], state["weights"]
+        self._conditioned(made(Rows, state["rows"]), [made(Scene, scene) for scene in state["scenes"]])
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -408,10 +345,9 @@ class ImageSourceGP(ClosedForm, kind="sources"):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; offsets of snapshots were estimated with the gains, which stay."""
-        if self.offsets == "none":
+        if self.settings.offsets == "none":
             data = replace(data, target=data.target * self.factors.numpy()[:, None])
-            inside = self.frame.inside(gather(data, rows, self.row_limit, self.seed))
-            self._conditioned(inside, [member.scene for member in self.members])
+            self._conditioned(self._rows(data, rows), [member.scene for member in self.members])
 
     def size(self) -> int:
         """Sources of the largest scene."""

@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 
 Offsets = Literal["none", "phase", "phase_timing"]
-KINDS: tuple[Offsets, ...] = ("none", "phase", "phase_timing")
 DELAYS = 512  # tried over one period of the tones, then refined by a parabola
 
 

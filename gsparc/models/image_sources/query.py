@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from functools import cached_property
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -13,8 +14,7 @@ from gsparc.models.image_sources.clutter.blocking import Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import directions
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
@@ -24,49 +24,48 @@ CHUNK = 128  # places at a time: sources x places x rows floats in memory
 VARIANCE_ROWS = 350  # that a variance is computed from: fewer overestimate it
 
 
-@dataclass(frozen=True)
-class PackedSources:
-    """Sources of one or more processes over the same n places.
+class Means:
+    """Means of every process, and the variance of one, at new places.
+
+    Args:
+        members: processes over the same rows, of K sources together.
+        variance_rows: rows that the variance is computed from; with 0 it is not.
 
     Attributes:
+        counts: sources of each process.
         sources: (K, 3) float64 [m].
-        constant: (K, 1, 1) float32, share of each gain's variance that is the same everywhere.
-        by_angle, by_length: (K, 1, 1) float32 `6 / angle^2` and `3 / length^2` of each source's visibility.
-        places: (n, 3) float64 [m], or (n, 6) with the static end's antennas; see `Rows.places`.
         orientations: (K, 3, 3) float64, how antennas of the static end are turned about each source.
+        places: (n, 3) float64 [m] of the rows, or (n, 6) with the static end's antennas; see `Rows.places`.
+        by_angle, by_length: (K, 1, 1) float32 `6 / angle^2` and `3 / length^2` of each source's visibility.
         towards: (K, 3, n) float32, unit vectors from source to place times `-6 / angle^2`.
+        level: (K, 1, 2 R), what does not vary of the gains, real and imaginary.
+        weights: (K, n, 2 R), of what varies.
         unfolding, obstacles: paths of the K sources and what occludes them; None without clutter.
     """
 
-    sources: Tensor
-    constant: Tensor
-    by_angle: Tensor
-    by_length: Tensor
-    places: Tensor
-    orientations: Tensor
-    towards: Tensor
-    unfolding: Unfolding | None
-    obstacles: Obstacles | None
+    unfolding: Unfolding | None = None
+    obstacles: Obstacles | None = None
 
-    @staticmethod
-    def of(scenes: list[Scene], places: Tensor) -> PackedSources:
-        """All sources of the scenes, in order."""
-        sources = torch.cat([scene.sources for scene in scenes])
-        kernels = torch.cat([_kernel_parameters(scene) for scene in scenes])[:, :, None, None]
-        turned = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
-        towards = (directions(places[:, :3], sources) * -kernels[:, 1]).mT.contiguous()
-        one, two, three = kernels.unbind(1)
-        packed = PackedSources(sources, one, two, three, places, turned, towards, None, None)
-        if not any(len(scene.clutter) for scene in scenes):
-            return packed
-        first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()
-        unfolding = Unfolding.concatenate(
-            [scene.unfolding.with_offset(start) for scene, start in zip(scenes, first, strict=False)]
-        )
-        obstacles = Obstacles.concatenate(
-            [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in scenes]
-        )
-        return replace(packed, unfolding=unfolding, obstacles=obstacles)
+    def __init__(self, members: Sequence[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
+        rows, scenes = members[0].rows, [member.scene for member in members]
+        self.places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
+        self.counts = [len(scene.sequences) for scene in scenes]
+        self.sources = torch.cat([scene.sources for scene in scenes])
+        self.orientations = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
+        numbers = [_kernel_numbers(scene.visibility) for scene in scenes]
+        each = torch.repeat_interleave(torch.tensor(numbers), torch.tensor(self.counts), 0)
+        constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
+        toward = directions(self.places[:, :3], self.sources)
+        self.towards = (toward * -self.by_angle).mT.contiguous()
+        if any(len(scene.clutter) for scene in scenes):
+            self.unfolding, self.obstacles = _together(scenes, self.counts)
+        dual = torch.cat([member.dual_weights for member in members])
+        dual = dual * torch.cat([scene.turns for scene in scenes])[:, None, None]
+        weight = torch.zeros(len(dual), len(self.places), rows.target.shape[1], dtype=dual.dtype)
+        real = torch.view_as_real(weight.index_add_(1, place_of, dual)).flatten(2)  # (K, n, 2 R)
+        self.weights = (real * (1 - constant)).contiguous()
+        self.level = real.sum(1, keepdim=True) * constant
+        self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
 
     def visible_share(self, queries: Tensor) -> Tensor | None:
         """Visible share (K, m) of each source from queries (m, 3 or 6) [m]; None without clutter."""
@@ -91,28 +90,6 @@ class PackedSources:
         decay = torch.exp(-root)
         return torch.addcmul(decay, root, decay)
 
-
-class Means:
-    """Means of every process, and the variance of one, at new places.
-
-    Args:
-        members: processes over the same rows.
-        variance_rows: rows that the variance is computed from; with 0 it is not.
-    """
-
-    def __init__(self, members: list[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
-        rows, scenes = members[0].rows, [member.scene for member in members]
-        places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
-        self.pack = PackedSources.of(scenes, places)
-        self.counts = [len(scene.sequences) for scene in scenes]
-        dual = torch.cat([member.dual_weights for member in members])
-        dual = dual * torch.cat([scene.turns for scene in scenes])[:, None, None]
-        weight = torch.zeros(len(dual), len(places), rows.target.shape[1], dtype=dual.dtype)
-        real = torch.view_as_real(weight.index_add_(1, place_of, dual)).flatten(2)  # (K, n, 2 R)
-        self.weights = (real * (1 - self.pack.constant)).contiguous()
-        self.level = real.sum(1, keepdim=True) * self.pack.constant
-        self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
-
     @cached_property
     def exact(self) -> Means:
         """The same in float64."""
@@ -132,7 +109,7 @@ class Means:
 
     def _part(self, part: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         gains, varying, seen = self._gains(part)
-        waves = wave_over_band(self.pack.ranges(part), tones, varying.dtype)  # (m, K, F)
+        waves = wave_over_band(self.ranges(part), tones, varying.dtype)  # (m, K, F)
         split = zip(gains.permute(1, 2, 0).split(self.counts, 2), waves.split(self.counts, 1), strict=True)
         means = torch.stack([gain @ each for gain, each in split])
         if self.variance is None:
@@ -148,8 +125,8 @@ class Means:
         return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Gains (K, m, R), see `PackedSources.varying`, and visible shares (K, m)."""
-        varying, seen = self.pack.varying(part), self.pack.visible_share(part)
+        """Gains (K, m, R), see `Means.varying`, and visible shares (K, m)."""
+        varying, seen = self.varying(part), self.visible_share(part)
         real = torch.baddbmm(self.level, varying, self.weights)
         gains = torch.view_as_complex(real.unflatten(2, (-1, 2)))
         return gains if seen is None else gains * seen[:, :, None], varying, seen
@@ -179,7 +156,7 @@ class RowVariance:
         self.across = across * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])[..., None]
 
     def __call__(self, arriving: Tensor, varying: Tensor) -> tuple[Tensor, Tensor]:
-        """Variance and prior (m,) of visible waves (m, K) before phases; see `PackedSources.varying`."""
+        """Variance and prior (m,) of visible waves (m, K) before phases; see `Means.varying`."""
         here = torch.view_as_real(arriving * self.phasor)  # (m, K, 2)
         there = torch.addcmul(self.level, varying[:, :, None, self.place_of], self.there)  # (K, m, 2, n)
         # Real and imaginary parts of queries with those of rows, (m, 2, 2, n); those in quadrature are the
@@ -191,8 +168,19 @@ class RowVariance:
         return (prior - known.view(-1, 2).sum(1)).clamp_min(0), prior
 
 
-def _kernel_parameters(scene: Scene) -> Tensor:
-    """Of each source: constant, 6 / angle^2 and 3 / length^2."""
-    kernel = scene.visibility
-    numbers = [float(kernel.constant), 6 * float(kernel.angle) ** -2, 3 * float(kernel.length) ** -2]
-    return torch.tensor(numbers).expand(len(scene.sequences), 3)
+def _kernel_numbers(kernel: KernelVisibility) -> list[float]:
+    """Constant, 6 / angle^2 and 3 / length^2."""
+    return [float(kernel.constant), 6 * float(kernel.angle) ** -2, 3 * float(kernel.length) ** -2]
+
+
+def _together(scenes: list[Scene], counts: list[int]) -> tuple[Unfolding, Obstacles]:
+    """Paths of all sources of the scenes, in order, and what occludes each of its own scene."""
+    planes = [scene.planes for scene in scenes]
+    transmitters = [scene.transmitter.expand(n, 3) for scene, n in zip(scenes, counts, strict=True)]
+    sequences = [
+        tuple(first + plane for plane in sequence)
+        for scene, first in zip(scenes, [0, *accumulate(map(len, planes))], strict=False)
+        for sequence in scene.sequences
+    ]
+    unfolding = Unfolding(torch.cat(transmitters), torch.cat(planes), tuple(sequences))
+    return unfolding, Obstacles([scene.clutter for scene in scenes], planes, counts)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene, correlations, steering
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, correlations, steering
 from gsparc.physics.mirror_planes import images
 from gsparc.processes.worker import late
 

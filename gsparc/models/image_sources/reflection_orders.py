@@ -138,15 +138,13 @@ def _triad(scene: Scene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
     normals = scene.planes[:, :3] / scene.planes[:, :3].norm(dim=1, keepdim=True)
-    best: tuple[int, Tensor] | None = None
-    for i in range(len(used)):
-        for j in range(i):
-            if (normals[i] @ normals[j]).abs() < 0.02 and (best is None or used[i] + used[j] > best[0]):
-                second = normals[j] - (normals[j] @ normals[i]) * normals[i]
-                second = second / second.norm()
-                third = torch.linalg.cross(normals[i], second)
-                best = used[i] + used[j], torch.stack([normals[i], second, third])
-    return None if best is None else best[1]
+    pairs = [(i, j) for i in range(len(used)) for j in range(i) if (normals[i] @ normals[j]).abs() < 0.02]
+    if not pairs:
+        return None
+    i, j = max(pairs, key=lambda pair: used[pair[0]] + used[pair[1]])
+    second = normals[j] - (normals[j] @ normals[i]) * normals[i]
+    second = second / second.norm()
+    return torch.stack([normals[i], second, torch.linalg.cross(normals[i], second)])
 
 
 def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
@@ -188,20 +186,13 @@ def reassign(scene: Scene, walls: Tensor) -> Scene:
 
 def prune(rows: Rows, scene: Scene, least: float) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
-    posterior = Posterior(rows, scene)
-    weakest_first: list[Reflections] = sorted(
-        scene.sequences[1:], key=lambda sequence: float(scene.log_amplitude[scene.sequences.index(sequence)])
-    )
-    indices = set(range(len(scene.sequences)))
-    for sequence in weakest_first:
+    posterior, kept = Posterior(rows, scene), list(range(len(scene.sequences)))
+    for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):
         if late():
             break
-        i = scene.sequences.index(sequence)
-        sole_user = any(sum(index in scene.sequences[j] for j in indices) == 1 for index in sequence)
-        current = scene.only(sorted(indices))
-        position = sorted(indices).index(i)
-        if posterior.without(position) - posterior.nll < (2 * least if sole_user else least):
-            indices.discard(i)
-            current = scene.only(sorted(indices))
-            posterior = Posterior(rows, current)
-    return scene.only(sorted(indices))
+        sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in scene.sequences[i])
+        lost = posterior.without(kept.index(i)) - posterior.nll
+        if lost < (2 * least if sole_user else least):
+            kept.remove(i)
+            posterior = Posterior(rows, scene.only(kept))
+    return scene.only(kept)

@@ -13,10 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
-from gsparc.ops import Pose
 from gsparc.physics.waves import ranges
-
-BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
 
 
 @dataclass(frozen=True)
@@ -60,13 +57,6 @@ class Rows:
         return static if self.array is None else static + self.array
 
 
-def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
-    """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""
-    if site.array is None or antennas == 1:
-        return position[:, None, :]
-    return position[:, None, :] + np.einsum("sij,ej->sei", rotation, np.asarray(site.array, np.float64))
-
-
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
     """Antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
 
@@ -78,13 +68,30 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
     return np.asarray(site.array, np.float64) @ np.asarray(rotation, np.float64).T
 
 
-def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> Tensor:
-    """The same (count, E, 3) for queries, with autograd: `count` poses, or one shared by all."""
-    places = rx.position.cpu().double().reshape(-1, 1, 3)
-    if site.array is not None and antennas > 1:
-        rotation = rx.rotation.cpu().double().reshape(-1, 3, 3)
-        places = places + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
-    return places.expand(count, -1, 3)
+def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
+    """Places (S, E, 3) [m] of the antennas at positions (S, 3); E = 1 when the array's geometry is unknown.
+
+    Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
+    """
+    if site.array is None or antennas == 1:
+        return position[:, None]
+    return position[:, None] + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
+
+
+def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor) -> Tensor:
+    """Where each antenna's channel is measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m].
+
+    Args:
+        site: where.
+        antennas: A, outputs of a measurement.
+        position: (S, 3) float64 [m] of the moving end.
+        rotation: (S, 3, 3), or (1, 3, 3), float64 of a moving receiver.
+    """
+    array = static_array(site, antennas)
+    if array is not None:
+        moving = position[:, None].expand(-1, len(array), -1)
+        return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
+    return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
 
 
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
@@ -106,43 +113,32 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     frequency, array = data.site.tones(), static_array(data.site, antennas)
     if len(index) > limit:
         index = index[np.sort(rng.permutation(len(index))[:limit])]
-    places = measured_places(data, index)
+    places = measured_places(data, index).numpy()
     per = places.shape[1]
     most = min(max(limit // max(len(index), 1), 1), per)
     wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
-    position, tone, target, receiver, element = [], [], [], [], []
+    parts = []
     for row, place in zip(index, places, strict=True):
-        values = data.target[row]  # (A, K)
+        values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:
                 continue
-            comb = np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)
-            chosen = known[comb]
-            tone.append(frequency[chosen])
-            position.append(np.repeat(place[e, None, :3], count, 0))
-            target.append(values[e, chosen][:, None] if per > 1 else values[:, chosen].T)
-            receiver.append(np.full(count, row))
-            element.append(np.full(count, e))
-    columns = (position, tone, [each.astype(np.complex64) for each in target], receiver)
-    rows = Rows(*(torch.from_numpy(np.concatenate(column)) for column in columns))
-    if array is None:
-        return rows
-    return replace(rows, array=torch.from_numpy(array), element=torch.from_numpy(np.concatenate(element)))
+            comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
+            at, target = np.repeat(place[e, None, :3], count, 0), values[e, comb][:, None]
+            target = target if per > 1 else values[:, comb].T
+            parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
+    *columns, element = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True))
+    rows = Rows(*columns)
+    return rows if array is None else replace(rows, array=torch.from_numpy(array), element=element)
 
 
-def measured_places(data: Measurements, index: np.ndarray) -> np.ndarray:
-    """Where each antenna's channel was measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m]."""
-    antennas = data.target.shape[1]
-    array = static_array(data.site, antennas)
-    if array is not None:
-        moving = np.repeat(data.moving[index][:, None], len(array), 1)
-        return np.concatenate([moving, np.broadcast_to(array, moving.shape)], 2)
-    if data.site.static_end == "rx":
-        return data.moving[index][:, None]
-    return elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
+def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
+    """`channel_places` of measurements (S,)."""
+    position, rotation = (torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation))
+    return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
 def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
@@ -156,16 +152,6 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
     if places.shape[1] > 3:
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
     return ranges(places[:, :3], sources)
-
-
-def scatterers(points: Tensor, box: Tensor) -> Tensor:
-    """Which sources (K, 3) [m], the transmitter first, are scatterers (K,) bool; others are images.
-
-    A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands inside
-    the box (2, 3) [m] of receivers and transmitter, the transmitter itself apart, is a scatterer.
-    """
-    inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
-    return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
 
 def box_of(rows: Rows, transmitter: Tensor) -> Tensor:

@@ -2,22 +2,68 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.models.image_sources.rows import Rows, box_of
+from gsparc.physics.mirror_planes import Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
+from gsparc.processes.kernel import matern32_of_squares
 
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
+BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
+ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared distance
+
+
+@dataclass(frozen=True)
+class KernelVisibility:
+    """`c + (1 - c) Matern-3/2(direction, place)`: a constant gain plus one that varies smoothly.
+
+    Sources do not occlude each other: each has its own gain process, and all share the kernel's parameters.
+
+    Attributes:
+        constant: share of the gain's variance that is the same everywhere.
+        angle: length scale of the direction to the source [rad].
+        length: length scale of the place [m].
+    """
+
+    constant: float | Tensor = 0.8
+    angle: float | Tensor = 0.5
+    length: float | Tensor = 2.0
+
+    def correlation(self, places: Tensor, source: Tensor) -> Tensor:
+        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
+
+        By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
+        """
+        squared = _squared(directions(places[:, :3], source)) / self.angle**2
+        if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
+            places = places.float()
+        squared = squared + _squared(places).float() / self.length**2
+        return self.constant + (1 - self.constant) * matern32_of_squares(squared)
+
+    @staticmethod
+    def of(value: Tensor) -> KernelVisibility:
+        """From the logit of `constant` and the logarithms of both lengths; differentiable."""
+        return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
+
+    def parameters(self, least: float, *shares: float) -> Tensor:
+        """Inverse of `of`, then the logits of more `shares`; all shares are at least `least`."""
+        clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
+        first, *rest = (math.log(share / (1 - share)) for share in clipped)
+        return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
+
+    def plain(self) -> KernelVisibility:
+        """With numbers instead of tensors."""
+        return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
 
 
 @final
@@ -44,11 +90,16 @@ class Scene:
     sequences: tuple[Reflections, ...]
     log_amplitude: Tensor
     log_noise: float
-    visibility: KernelVisibility = KernelVisibility()  # noqa: RUF009 frozen
+    visibility: KernelVisibility = KernelVisibility()
     clutter: Clutter = field(default_factory=Clutter.none)
     phase: Tensor | None = None
     quadrature: float = 1.0
     noise_floor: float = JITTER
+
+    @staticmethod
+    def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
+        """The static end (3,) [m] alone, of log amplitude (1,)."""
+        return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
 
     @cached_property
     def sources(self) -> Tensor:
@@ -58,7 +109,12 @@ class Scene:
     @cached_property
     def unfolding(self) -> Unfolding:
         """The legs of every sequence's path."""
-        return Unfolding.of(self.transmitter, self.planes, self.sequences)
+        return Unfolding(self.transmitter, self.planes, self.sequences)
+
+    @property
+    def walls(self) -> list[int]:
+        """Numbers of planes that make a source of one reflection."""
+        return [i for i in range(len(self.planes)) if (i,) in self.sequences]
 
     @property
     def turns(self) -> Tensor:
@@ -71,6 +127,16 @@ class Scene:
         if not len(self.clutter):
             return torch.ones(1, 1)
         return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
+
+    def scatterers(self, rows: Rows) -> Tensor:
+        """Which sources (K,) bool are scatterers; others are images.
+
+        A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands
+        inside the box of receivers and transmitter, the transmitter itself apart, is a scatterer.
+        """
+        points, box = self.sources, box_of(rows, self.transmitter)
+        inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
+        return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
     def images(self, rows: Rows) -> Tensor:
         """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
@@ -85,6 +151,13 @@ class Scene:
         """The same, attenuated by clutter."""
         waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
         return waves if self.phase is None else waves * self.turns
+
+    def longer(self, order: int) -> list[Reflections]:
+        """Other sequences over the planes: those of up to `order` with one more at the end, and all pairs."""
+        indices = range(len(self.planes))
+        more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
+        known = set(self.sequences)
+        return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
     def over(self, sequences: Iterable[Reflections]) -> Scene:
         """Other sequences over the same planes, of gains that are not known."""
@@ -115,39 +188,6 @@ class Scene:
             phase=None if self.phase is None else self.phase[indices],
         )
 
-    def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers of a scene with phases, without the noise floor."""
-        kernel = self.visibility
-        return {
-            "transmitter": self.transmitter,
-            "planes": self.planes,
-            "sequences": [list(sequence) for sequence in self.sequences],
-            "log_amplitude": self.log_amplitude,
-            "log_noise": self.log_noise,
-            "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
-            "phase": self.phase,
-            "turning": self.quadrature,
-            "boxes": self.clutter.boxes,
-            "patches": self.clutter.patches,
-            "patched": list(self.clutter.plane),
-        }
-
-    @staticmethod
-    def from_state(state: dict[str, Any], noise_floor: float) -> Scene:
-        """Inverse of `state`."""
-        return Scene(
-            state["transmitter"],
-            state["planes"],
-            tuple(map(tuple, state["sequences"])),
-            state["log_amplitude"],
-            float(state["log_noise"]),
-            KernelVisibility(*state["visibility"]),
-            Clutter(state["boxes"], state["patches"], tuple(state["patched"])),
-            state["phase"],
-            float(state["turning"]),
-            noise_floor,
-        )
-
 
 def steering(rows: Rows, sources: Tensor) -> Tensor:
     """Spherical waves (n, K) complex64 of sources at every row.
@@ -175,3 +215,23 @@ def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
     """Visibility correlations (K, n, n) float32."""
     return torch.stack([kernel.correlation(rows.places, source) for source in sources])
+
+
+def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
+    offset = places - sources[..., None, :]
+    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
+
+
+def _is_wide(places: Tensor, length: float) -> bool:
+    """Whether squared distances need float64: of 5 km those in float32 are off by a square metre.
+
+    Elsewhere float64 would only double the time of a search.
+    """
+    reach = float(places.abs().max()) if places.numel() else 0.0
+    return torch.finfo(torch.float32).eps * reach**2 > ROUNDED * length**2
+
+
+def _squared(a: Tensor) -> Tensor:
+    length = a.square().sum(-1)
+    return (length[:, None] + length[None] - 2 * a @ a.T).clamp_min(0)

@@ -5,31 +5,28 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import get_args
 
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
+from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
 from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.phase_offsets import Offsets
 from gsparc.models.image_sources.refine import learn_visibility, refine
-from gsparc.models.image_sources.reflection_orders import (
-    drop_planes,
-    find_walls,
-    orthogonal_walls,
-    prune,
-    reassign,
-)
 from gsparc.models.image_sources.rows import Rows, box_of
-from gsparc.models.image_sources.scene import Scene, direct_amplitude
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
+from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late
 
 log = logging.getLogger(__name__)
 
+NOISE = 0.1  # variance at the start, of unit signal power
 PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
@@ -40,24 +37,32 @@ LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths ar
 
 
 @dataclass(frozen=True)
-class SearchSettings:
-    """How far a search goes, and what it starts from.
+class SearchSettings(Checked):
+    """What is searched for, on which rows, and how far.
 
     Attributes:
+        searches: how many, with different seeds; their predictions are averaged.
+        search_rows: receivers times tones of a search.
+        rows: receivers times tones of the final process.
         margin: of the search box around receivers and transmitter [m].
-        order: largest reflection order of a source.
         max_sources: that end the search.
+        order: largest reflection order of a source.
+        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
+        clutter: search for occluding boxes and finite mirrors, shared by all sources.
+        seed: of everything random in the first search; the others count on.
         final_steps: of refinement at the end.
-        noise: variance at the start, of unit signal power.
-        visibility: initial kernel and centre of its prior.
     """
 
-    margin: float = 8.0
-    order: int = 3
-    max_sources: int = 60
+    searches: int = setting(6, whole(1))
+    search_rows: int = setting(700, whole(8))
+    rows: int = setting(3000, whole(8))
+    margin: float = setting(8.0, POSITIVE)
+    max_sources: int = setting(60, whole(1))
+    order: int = setting(3, whole(0))
+    offsets: Offsets = setting("none", choice(*get_args(Offsets)))
+    clutter: bool = setting(True, switch())
+    seed: int = 0
     final_steps: int = 80
-    noise: float = 0.1
-    visibility: KernelVisibility = field(default_factory=KernelVisibility)
 
 
 class Search:
@@ -67,23 +72,20 @@ class Search:
         rows: a few hundred.
         transmitter: (3,) float64 [m].
         settings: how.
-        seed: of the candidates.
+        number: of the search, added to the seed of the candidates.
         last_round: asked after every round; no other starts when it says so.
     """
 
     def __init__(
-        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
+        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
         last_round: Callable[[], bool],
     ) -> None:  # fmt: skip
         self.rows, self.settings, self.last_round = rows, settings, last_round
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
-        self.scene = Scene(
-            transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),),
-            direct_amplitude(rows, transmitter).log().reshape(1), math.log(settings.noise),
-            settings.visibility,
-        )  # fmt: skip
+        loudness = direct_amplitude(rows, transmitter).log().reshape(1)
+        self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
@@ -98,11 +100,11 @@ class Search:
                 break
             self._refine(STEPS)
             if free or number % 2:
-                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
+                self.scene = orders.drop_planes(self.rows, self.scene, 2 * self.wavelength)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, PRUNE)
+                self.scene = orders.prune(self.rows, self.scene, PRUNE)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -120,11 +122,11 @@ class Search:
     def _finish(self) -> Scene:
         self._refine(20)
         self._find_walls()
-        self._reassign(orthogonal_walls(self.scene))
-        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
+        self._reassign(orders.orthogonal_walls(self.scene))
+        self.scene = orders.drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
         self._refine(STEPS)
-        self.scene = prune(self.rows, self.scene, PRUNE)
+        self.scene = orders.prune(self.rows, self.scene, PRUNE)
         self._learn_visibility(10)
         self._refine(self.settings.final_steps)
         return self.scene
@@ -135,28 +137,19 @@ class Search:
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
+            self.scene = learn_visibility(few, self.scene, steps, KernelVisibility())
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
-        s, scene = self.settings, self.scene
-        indices = list(range(len(scene.planes)))
-        longer: list[Reflections] = [
-            (*w, i) for w in scene.sequences if len(w) < s.order for i in indices if not w or w[-1] != i
-        ]
-        known = set(scene.sequences)
-        sequences = [w for w in dict.fromkeys(longer + all_sequences(indices, 2)) if w not in known]
-        if not sequences:
+        scene, most = self.scene, most or SEQUENCES_PER_ROUND
+        more = scene.over(scene.longer(self.settings.order))
+        if not more.sequences:
             return 0
-        position = images(scene.transmitter, scene.planes, sequences)
-        candidates = scene.over(sequences).images(self.rows)
-        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).conditioned)
-        clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
-        chosen = pick_apart(
-            position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
-        )
+        scores, amplitude = score(Posterior(self.rows, scene), more.images(self.rows))
+        apart = 0.5 * self.wavelength
+        chosen = pick_apart(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
         if chosen:
-            self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
+            self.scene = scene.with_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
     def _add_free(self) -> int:
@@ -170,22 +163,17 @@ class Search:
             if number and late():
                 break
             spread = partial(self._spread, parent)
-            sources = search_box(
-                self.rows, posterior.conditioned, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
-                self.generator, spread,
-            )  # fmt: skip
-            added = 0
-            for position, gained, amplitude in sources:
-                if gained < FREE_SCORE:
-                    continue
+            apart = 0.5 * self.wavelength
+            found = search_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
+            found = [source for source in found if source[1] >= FREE_SCORE]
+            for position, _, amplitude in found:
                 sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
                 self.scene = replace(self.scene, planes=planes).with_sequences(
                     [(*sequence, len(planes) - 1)], amplitude[None]
                 )
-                added += 1
-            if added:
-                return added
+            if found:
+                return len(found)
         return 0
 
     def _able(self, scene: Scene) -> list[int]:
@@ -214,7 +202,7 @@ class Search:
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
-        scores = score(self.rows, candidates, posterior.conditioned)[0].reshape(mirrored.shape[:2])
+        scores = score(posterior, candidates)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas
@@ -226,14 +214,14 @@ class Search:
         """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
         if len(self.scene.sequences) < 6:
             return
-        self._reassign(find_walls(self.scene.sources))
+        self._reassign(orders.find_walls(self.scene.sources))
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
         if walls is None or late():
             return
         before = self.scene
-        self.scene = reassign(before, walls)
+        self.scene = orders.reassign(before, walls)
         self._refine(20)
         for _ in range(2):
             if self._add_sequences(6):

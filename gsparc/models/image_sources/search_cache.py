@@ -15,6 +15,7 @@ from gsparc.data.files import whole_file
 from gsparc.data.raw import stored_archive
 from gsparc.models.checkpoint import SEARCHES
 from gsparc.models.image_sources.scene import Scene
+from gsparc.models.plain import made, plain
 from gsparc.training.time_budget import NOTHING, Clock, Spent, TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
@@ -82,22 +83,17 @@ class SearchCache:
         self._searches, self.spent, self.limited_by = searches, spent, stored.get("limited_by")
         log.info("reusing %d cached searches (%.0f s of training time)", len(searches), wall)
 
-    def find(self, number: int, noise_floor: float) -> Member | None:
+    def find(self, number: int) -> Member | None:
         """The finished search of this number, or None."""
         with self._lock:
             search = self._searches.get(f"search {number}")
-        if search is None:
-            return None
-        return Member(Scene.from_state(search["scene"], noise_floor), search["left_out"], number)
+        return None if search is None else made(Member, search)
 
     def put(self, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
-            self._searches[f"search {member.number}"] = {
-                "scene": member.scene.state(),
-                "left_out": member.left_out,
-            }
+            self._searches[f"search {member.number}"] = plain(member)
             self._write()
 
     def interrupted(self) -> str:

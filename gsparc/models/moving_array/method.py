@@ -21,7 +21,7 @@ from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
-from gsparc.models.moving_array.error_model import ErrorModel, fit_error_model, image_features
+from gsparc.models.moving_array.error_regression import ErrorRegression, fit_errors, image_features
 from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import Array, Images, reduced
 from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
@@ -264,7 +264,7 @@ class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
             features.append(image_features(images, energy[part]))
         # two images drawn at random differ by twice the variance
         prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
-        self.error_model = fit_error_model(
+        self.errors = fit_errors(
             spectra.places, torch.cat(relative), torch.cat(features), kernel,
             float(np.mean([trend.kernel.length for trend in self.trends])), prior,
         )  # fmt: skip
@@ -281,7 +281,7 @@ class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """See `Differentiable`; `explained` are the sources' images alone."""
-        query, errors = self.query(), self.error_model
+        query, errors = self.query(), self.errors
         if dtype == torch.float64:
             query, errors = query.exact, in_double(errors)
         answer = query(queries)
@@ -334,7 +334,7 @@ class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
             "basis": vars(self.basis),
             "residual": self.residual.state(),
             "positions": torch.from_numpy(self.positions),
-            "errors": self.error_model.state(),
+            "errors": self.errors.state(),
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
@@ -342,7 +342,7 @@ class MovingArrayField(Differentiable, ClosedForm, kind="bearings"):
         self.trends = [Trend.from_state(trend) for trend in state["trends"]]
         self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
         self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()
-        self.error_model = ErrorModel.from_state(state["errors"])
+        self.errors = ErrorRegression.from_state(state["errors"])
 
 
 def _spread(count: int, limit: int) -> np.ndarray:

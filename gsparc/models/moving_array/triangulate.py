@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
+from gsparc.models.terms import no_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 
@@ -80,16 +81,9 @@ def mixture(power: Tensor, atoms: Tensor) -> Tensor:
 
 
 def find_sources(
-    lags: Tensor,
-    receivers: Tensor,
-    first: Tensor | None,
-    rotation: Tensor,
-    space: Lags,
-    grid: SphereGrid,
-    settings: SearchSettings,
-    seed: int,
-    over: Callable[[], bool],
-) -> Tensor:
+    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
+    settings: SearchSettings, seed: int, over: Callable[[], bool],
+) -> Tensor:  # fmt: skip
     """Positions (K, 3) float32 [m] of sources.
 
     Args:
@@ -147,13 +141,9 @@ def find_sources(
 
 
 def _best(
-    candidates: Tensor,
-    images: Tensor,
-    receivers: Tensor,
-    rotation: Tensor,
-    grid: SphereGrid,
+    candidates: Tensor, images: Tensor, receivers: Tensor, rotation: Tensor, grid: SphereGrid,
     settings: SearchSettings,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
     score = torch.zeros(len(candidates))
     for image, receiver in zip(images, receivers, strict=True):
@@ -198,13 +188,10 @@ def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
 
 def site_problem(data: Measurements) -> str | None:
     """Why sources cannot be triangulated from these measurements; None when they can."""
-    site = data.site
-    if site.kind != "spectrum":
-        return f"bearings need spectra, these are {site.kind}"
-    if site.static_end != "tx":
-        return "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
-    if site.array is None or site.grid is None or site.wavelength is None:
-        return "the dataset does not say which array (array_position) and carrier its spectra are of"
+    otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
+    problem = no_array(data.site, "tx", otherwise)
+    if problem is not None:
+        return problem
     if not np.allclose(data.rx_rotation, data.rx_rotation[0], atol=1e-6):
         return "the receiver turns as it moves; bearings need one orientation"
     return None

@@ -21,7 +21,7 @@ from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
-from gsparc.processes.censored import Sites
+from gsparc.processes.censored import ConditionalGaussian, Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
@@ -40,6 +40,7 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 CHOSEN_ON = Effort.chosen_on
 COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
+SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
@@ -190,18 +191,21 @@ def _settings(
     weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
+    scores = [one.score for one in candidates]
     if both and not late():
-        candidates = [_weighed(weighed, one) for one in candidates]
-    best = max(candidates, key=lambda one: one.score)
+        weighed = _in_doubt(weighed, candidates[-1])
+        scores = [_weighed(weighed, one, 0).score for one in candidates]
+    best = candidates[int(np.argmax(scores))]
     if len(loud.places) >= TWO_LENGTHS_NEED and not late():
-        two = _searched(few, best, _pairs(few, best.kernel), 2.0)
-        best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not both and not late():
+        best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
+    if len(loud.places) > len(few.places) and not late():
         # A look at all rows costs several at few: what was found on these is near already.
         best = _searched(loud, best, [best.kernel], looks=REFINED)
+    if both and not late():  # one walk: each look factors several covariances
+        best = _weighed(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
-        note = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
+        note = f"settings chosen on {count} of {len(rows.places)} rows"
         return replace(best, notes=(*best.notes, note))
     return best
 
@@ -261,8 +265,20 @@ def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
     return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
-def _weighed(rows: Rows, one: Candidate) -> Candidate:
-    """The same with settings of largest evidence, silent rows among the rest."""
+def _in_doubt(rows: Rows, one: Candidate) -> Rows:
+    """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
+    distance, terms, values = _views(rows, one.trend)
+    gram = one.kernel.amplitude * gram_of(one.kernel, distance, terms)
+    silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
+    known = ConditionalGaussian.of(gram, values[:, 0], silent)
+    doubt = torch.from_numpy(rows.side)[silent] * known.doubt(values[silent, 0])
+    used = ~rows.silent
+    used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
+    return rows.at(np.flatnonzero(used))
+
+
+def _weighed(rows: Rows, one: Candidate, looks: int) -> Candidate:
+    """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
     distance, terms, values = _views(rows, one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
@@ -276,6 +292,8 @@ def _weighed(rows: Rows, one: Candidate) -> Candidate:
         return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
-    best, value = walked(objective, [start], bounds, EVIDENCE_LOOKS, EVIDENCE_SETTLED)
+    best, value = start, float(objective(torch.from_numpy(start)))
+    if looks:
+        best, value = walked(objective, [start], bounds, looks, EVIDENCE_SETTLED)
     kernel = replace(one.kernel.at(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)

@@ -32,39 +32,38 @@ class SearchResult:
     uplink: Tensor
     noise: Tensor
 
+    def features(self, mean: Tensor, aperture: Aperture) -> Tensor:
+        """Features (B, 10) of the error at an aperture with predicted channels `mean` (B, A, K).
 
-def error_features(result: SearchResult, mean: Tensor, aperture: Aperture) -> Tensor:
-    """Features (B, 10) of the error at an aperture with predicted channels `mean` (B, A, K).
-
-    Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation, number and
-    delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
-    """
-    sources = result.sources
-    power = result.uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
-    strength = sources.gain.abs().square()
-    total = strength.sum(1).clamp_min(1e-30)
-    turns = 2 * math.pi * aperture.tones.abs().max()
-    delay_error = (strength * (1 - torch.exp(-(turns**2) * sources.delay_variance))).sum(1)
-    gain_variance = sources.variance.sum(1)
-    share = strength / total[:, None]
-    middle = (share * sources.delay).sum(1, keepdim=True)
-    columns = [
-        result.noise / power,
-        result.residual.abs().square().mean((1, 2)) / result.noise.clamp_min(1e-30),
-        sources.error_variance(aperture) / power,
-        (delay_error + gain_variance) / power,
-        total / power,
-        1 / share.square().sum(1),
-        (share * (sources.delay - middle) ** 2).sum(1).sqrt(),
-        gain_variance / power,
-        mean.abs().square().mean((1, 2)) / power,
-        torch.full_like(power, mean[0].numel()),
-    ]
-    return torch.stack([column.clamp_min(1e-9).log10() for column in columns], 1)
+        Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation, number
+        and delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
+        """
+        sources = self.sources
+        power = self.uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
+        strength = sources.gain.abs().square()
+        total = strength.sum(1).clamp_min(1e-30)
+        turns = 2 * math.pi * aperture.tones.abs().max()
+        delay_error = (strength * (1 - torch.exp(-(turns**2) * sources.delay_variance))).sum(1)
+        gain_variance = sources.variance.sum(1)
+        share = strength / total[:, None]
+        middle = (share * sources.delay).sum(1, keepdim=True)
+        columns = [
+            self.noise / power,
+            self.residual.abs().square().mean((1, 2)) / self.noise.clamp_min(1e-30),
+            sources.error_variance(aperture) / power,
+            (delay_error + gain_variance) / power,
+            total / power,
+            1 / share.square().sum(1),
+            (share * (sources.delay - middle) ** 2).sum(1).sqrt(),
+            gain_variance / power,
+            mean.abs().square().mean((1, 2)) / power,
+            torch.full_like(power, mean[0].numel()),
+        ]
+        return torch.stack([column.clamp_min(1e-9).log10() for column in columns], 1)
 
 
 @dataclass(frozen=True)
-class ErrorModel:
+class RelativeErrorRegression:
     """Expected logarithm of the relative error as a quadratic form of the features.
 
     Attributes:
@@ -86,19 +85,19 @@ class ErrorModel:
         logarithm = _quadratic((features - self.middle) / self.scale) @ self.weights
         return self.smearing * 10 ** logarithm.clamp(self.low, self.high)
 
-
-def fit_error_model(features: Tensor, relative_error: Tensor) -> ErrorModel:
-    """Fit to features (n, S) and relative errors (n,)."""
-    middle, scale = features.mean(0), features.std(0, correction=0).clamp_min(1e-3)
-    terms = _quadratic((features - middle) / scale).double()
-    target = relative_error.clamp_min(LEAST_ERROR).log10().double()
-    penalty = RIDGE * len(features) * torch.eye(terms.shape[1], dtype=torch.float64)
-    penalty[0, 0] = 0
-    weights = torch.linalg.solve(terms.T @ terms + penalty, terms.T @ target)
-    low, high = np.quantile(target.numpy(), [0.001, 0.999])
-    expected = 10 ** (terms @ weights).clamp(low, high)
-    smearing = relative_error.clamp_max(10**high).double().mean() / expected.mean()
-    return ErrorModel(middle, scale, weights.float(), float(low), float(high), float(smearing))
+    @classmethod
+    def of(cls, features: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
+        """Fit to features (n, S) and relative errors (n,)."""
+        middle, scale = features.mean(0), features.std(0, correction=0).clamp_min(1e-3)
+        terms = _quadratic((features - middle) / scale).double()
+        target = relative_error.clamp_min(LEAST_ERROR).log10().double()
+        penalty = RIDGE * len(features) * torch.eye(terms.shape[1], dtype=torch.float64)
+        penalty[0, 0] = 0
+        weights = torch.linalg.solve(terms.T @ terms + penalty, terms.T @ target)
+        low, high = np.quantile(target.numpy(), [0.001, 0.999])
+        expected = 10 ** (terms @ weights).clamp(low, high)
+        smearing = relative_error.clamp_max(10**high).double().mean() / expected.mean()
+        return cls(middle, scale, weights.float(), float(low), float(high), float(smearing))
 
 
 def _quadratic(x: Tensor) -> Tensor:

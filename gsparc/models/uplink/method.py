@@ -14,13 +14,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.uplink.error_model import (
-    ErrorModel,
-    SearchResult,
-    error_features,
-    estimate_noise,
-    fit_error_model,
-)
+from gsparc.models.uplink.error_model import RelativeErrorRegression, SearchResult, estimate_noise
 from gsparc.models.uplink.interface import UplinkMethod
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
@@ -59,7 +53,7 @@ class UplinkField(UplinkMethod):
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
         self.settings, self.teachers = search, teachers
         self.shrink, self.seed = shrink, seed
-        self.error_model: ErrorModel | None = None
+        self.error_model: RelativeErrorRegression | None = None
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -77,7 +71,7 @@ class UplinkField(UplinkMethod):
         self._prepare(self.site, replace(self.settings, leakage=best))
         # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.error_model = fit_error_model(*self._training_errors(data, rows, rng, PIECES))
+        self.error_model = RelativeErrorRegression.of(*self._training_errors(data, rows, rng, PIECES))
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(started.spent, (note,))
 
@@ -106,7 +100,7 @@ class UplinkField(UplinkMethod):
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
                 error.append(_power(mean - true) / _power(true).clamp_min(1e-30))
-                features.append(error_features(result, mean, aperture))
+                features.append(result.features(mean, aperture))
         return torch.cat(features), torch.cat(error)
 
     # ---- predicting ----
@@ -130,7 +124,7 @@ class UplinkField(UplinkMethod):
         with torch.inference_mode():  # a fifth less overhead in a single query
             result = self._search(uplink, noise)
             mean = result.sources.response(aperture)
-            error = self.error_model.expected(error_features(result, mean, aperture))
+            error = self.error_model.expected(result.features(mean, aperture))
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
             variance = error * _power(mean)
@@ -144,14 +138,12 @@ class UplinkField(UplinkMethod):
         # Timing differs between snapshots: search delays about their mean, then add it back.
         mean = mean_delay(uplink)
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
-        parts = [
-            self.search(straight[i : i + CHUNK], noise[i : i + CHUNK]) for i in range(0, len(uplink), CHUNK)
-        ]
-        sources, left = parts[0]
-        if len(parts) > 1:
-            sources = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(sources)))
-            left = torch.cat([rest for _, rest in parts])
-        return SearchResult(replace(sources, delay=sources.delay + mean[:, None]), left, uplink, noise)
+        chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
+        found, left = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
+        sources = Sources(*map(torch.cat, zip(*(vars(part).values() for part in found), strict=True)))
+        return SearchResult(
+            replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
+        )
 
     def _prepare(self, site: Site, settings: SearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
@@ -177,7 +169,7 @@ class UplinkField(UplinkMethod):
         """See `Method.restore`."""
         self.site = site
         self._prepare(site, SearchSettings(**state["search"]))
-        self.error_model = None if state["trust"] is None else ErrorModel(**state["trust"])
+        self.error_model = None if state["trust"] is None else RelativeErrorRegression(**state["trust"])
 
     def size(self) -> int:
         """Sources of a snapshot."""

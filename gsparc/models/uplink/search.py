@@ -50,9 +50,8 @@ class Sources:
     @property
     def delay_variance(self) -> Tensor:
         """Of the delays (B, N), turns^2 per tone^2."""
-        return torch.diagonal(self.position_covariance, dim1=1, dim2=2)[:, -self.delay.shape[1] :].clamp_min(
-            0
-        )
+        variance = torch.diagonal(self.position_covariance, dim1=1, dim2=2)
+        return variance[:, -self.delay.shape[1] :].clamp_min(0)
 
     def response(self, aperture: Aperture) -> Tensor:
         """Channels (B, A, K) complex64."""

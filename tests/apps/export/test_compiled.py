@@ -1,7 +1,5 @@
 """Fields exported for C answer as the model does, from any number of threads; what is damaged is refused."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal
@@ -147,19 +145,15 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
 
 
 MODELS = {
-    "powers, all rows": partial(of_powers, 300),
-    "powers, variance of the nearest": partial(of_powers, 1500),
+    "powers, all rows": partial(of_powers, 300), "powers, variance of the nearest": partial(of_powers, 1500),
     "powers, the nearest": partial(of_powers, 700),
     "powers, a mean of processes": partial(of_powers, 120, "gsparc"),
-    "powers, distilled": partial(of_powers, 80, "idw"),
-    "sources": partial(of_sources, 1),
-    "sources, many tones": partial(of_sources, 40),
-    "sources, four antennas": partial(of_sources, 7, 4),
+    "powers, distilled": partial(of_powers, 80, "idw"), "sources": partial(of_sources, 1),
+    "sources, many tones": partial(of_sources, 40), "sources, four antennas": partial(of_sources, 7, 4),
     "image of a process": partial(of_images, "gp"),
     "image of Gaussians": partial(of_images, "gsparc", effects=EffectSettings(residual=False)),
-    "image, distilled": partial(of_images, "idw"),
-    "array": None,
-}
+    "image, distilled": partial(of_images, "idw"), "array": None,
+}  # fmt: skip
 
 
 @pytest.mark.slow

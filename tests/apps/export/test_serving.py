@@ -1,7 +1,5 @@
 """Answers over HTTP: many clients, malformed requests, clients that die, a stop after what is under way."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
@@ -184,31 +182,28 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
     assert sum(calls) == sum(map(len, given)) and len(calls) < len(given)
 
 
-@pytest.mark.parametrize(
-    ("body", "kind", "status"),
-    [
-        ("", "application/json", 422),
-        ("{", "application/json", 422),
-        ("[1, 2]", "application/json", 422),
-        ('{"places": "here"}', "application/json", 422),
-        ('{"places": [[1, 2]]}', "application/json", 422),
-        ('{"places": [[1, 2], [3, 4, 5]]}', "application/json", 422),
-        ('{"places": [[1, 2, NaN]]}', "application/json", 422),
-        ('{"places": []}', "application/json", 422),
-        (b"\xff\xfe", "application/json", 422),
-        ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
-        ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
-        ('{"places": [[1, 2, true]]}', "application/json", 422),
-        ('{"places": [[1, 2, "3"]]}', "application/json", 422),
-        ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
-        ('{"places": ' + "[" * 60, "application/json", 422),
-        ('{"places": ' + "[" * 9000, "application/json", 413),
-        (b"12345", RAW, 422),
-        (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
-        (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
-        (b"0" * 100_000, RAW, 413),
-    ],
-)
+@pytest.mark.parametrize(("body", "kind", "status"), [
+    ("", "application/json", 422),
+    ("{", "application/json", 422),
+    ("[1, 2]", "application/json", 422),
+    ('{"places": "here"}', "application/json", 422),
+    ('{"places": [[1, 2]]}', "application/json", 422),
+    ('{"places": [[1, 2], [3, 4, 5]]}', "application/json", 422),
+    ('{"places": [[1, 2, NaN]]}', "application/json", 422),
+    ('{"places": []}', "application/json", 422),
+    (b"\xff\xfe", "application/json", 422),
+    ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
+    ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
+    ('{"places": [[1, 2, true]]}', "application/json", 422),
+    ('{"places": [[1, 2, "3"]]}', "application/json", 422),
+    ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
+    ('{"places": ' + "[" * 60, "application/json", 422),
+    ('{"places": ' + "[" * 9000, "application/json", 413),
+    (b"12345", RAW, 422),
+    (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
+    (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
+    (b"0" * 100_000, RAW, 413),
+])  # fmt: skip
 def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, kind, status):
     found = served.post(body, kind)
     assert found[0] == status and "\n" not in json.loads(found[1])["detail"]

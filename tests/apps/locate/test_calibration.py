@@ -1,7 +1,5 @@
 """Trust that is learned from places left out, and whether areas keep their promise on others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`locate`: places from values in the units and shapes of predictions."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np

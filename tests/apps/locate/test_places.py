@@ -1,13 +1,11 @@
 """`gsparc compare task=locate`: models that were kept say where their test rows were heard."""
 
-from __future__ import annotations
-
 import pytest
-from campaigns import compose, spectra
+import towns
+from campaigns import spectra
 from hydra import initialize_config_module
 
 from gsparc.commands.locate import locate
-from gsparc.commands.train import train
 from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.places import compare_places, facts_and_table
@@ -19,10 +17,9 @@ SETTINGS = {"fingerprints": {}, "splits": [], "against": ["nearest"], "calibrate
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cells")
-    file = spectra(folder / "own.npz", rows=60)
     for model in ("gp", "idw"):
-        chosen = f"model={model}", "baselines=[]", "logger=none"
-        train(compose("dataset=own", f"dataset.file='{file}'", *chosen), folder / model)
+        (folder / model).mkdir()
+        towns.trained(spectra(folder / model / "own.npz", rows=60), model)
     cells = [Filled(Cell("own", "random", model, None, None), folder / model, {}) for model in ("gp", "idw")]
     return [*cells, Filled(Cell("own", "random", "gone", None, None), folder / "gone", {})]
 

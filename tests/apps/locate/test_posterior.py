@@ -1,7 +1,5 @@
 """Cells, masses, areas and modes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

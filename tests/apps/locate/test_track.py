@@ -1,7 +1,5 @@
 """The filter over a track: steps, jumps, what it is against plain sums, and its speed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.apps.locate.cells import Cells, cover

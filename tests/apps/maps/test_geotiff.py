@@ -1,7 +1,5 @@
 """A GeoTIFF lies at the right place on Earth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

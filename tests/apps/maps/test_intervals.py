@@ -1,7 +1,5 @@
 """Intervals hold what they promise on blocks they never saw, widen with distance, and end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A map is what the model predicts cell by cell, with its layers over stations."""
 
-from __future__ import annotations
-
 import signal
 import time
 from dataclasses import replace

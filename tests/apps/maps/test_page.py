@@ -1,7 +1,5 @@
 """The page of a map, opened from its file in a headless browser."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

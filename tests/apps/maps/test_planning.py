@@ -1,7 +1,5 @@
 """Places to measure: they fall where nobody measured, take error away, and make a short walk."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

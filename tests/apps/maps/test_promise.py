@@ -1,7 +1,5 @@
 """What a promise covers, on towns that no calibration saw."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import cholesky
@@ -11,6 +9,7 @@ from gsparc.apps.maps.promise import PromiseSettings, gather, predict_rows
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
 
 TOWNS, ROWS, SHARE = 30, 200, 0.9
@@ -38,7 +37,8 @@ def test_intervals_of_thirty_towns_hold_a_measurement_as_often_as_promised_and_t
         (fold,) = make_split(data.moving, cut).folds
         method, context = GaussianProcess(), FitContext(seed=seed)
         method.fit(data, fold, context)
-        promise = gather(method, GaussianProcess, data, fold, PromiseSettings(seed=seed), context)
+        learned = Learned(method, GaussianProcess, data, fold, context)
+        promise = gather(learned, PromiseSettings(seed=seed))
         mean, spread = predict_rows(method, data, fold.test)
         far = promise.distance(data.moving[fold.test], 0)
         half = promise.calibration(SHARE).interval(spread, far, np.zeros(len(far), int))

@@ -1,7 +1,5 @@
 """Models small enough to be trained here: spectra of rendered Gaussians, and powers of two stations."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp

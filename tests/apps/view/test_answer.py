@@ -1,7 +1,5 @@
 """What is answered at a place, and what is said of why."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

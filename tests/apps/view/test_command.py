@@ -1,7 +1,5 @@
 """`gsparc view`: what it writes, and what it refuses in one line."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +47,7 @@ def test_without_viser_one_line_says_what_to_install(here, monkeypatch, more):
 
 @pytest.mark.parametrize("more, said", [
     (["save=scene.obj"], "expected a name that ends with .html, .png, .ply"),
-    (["port=70000"], "a number from 0 to 65535"),
+    (["port=70000"], "at least 0 and at most 65535"),
     (["save=a.png", "station=nowhere"], "there are east, west"),
     (["save=a.png", "at=[1,2]"], "three finite numbers"),
     (["save=a.png", "map=missing.npz"], "expected map.npz of gsparc map"),

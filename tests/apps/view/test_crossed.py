@@ -1,7 +1,5 @@
 """Walls and boxes on the straight line between two places."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

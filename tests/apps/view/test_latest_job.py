@@ -1,7 +1,5 @@
 """Only the newest of what is asked is done, and nothing waits for a long job."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """Planes of power: coarse first, exact at the end."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

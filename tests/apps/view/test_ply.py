@@ -1,7 +1,5 @@
 """Splat files in the layout that viewers expect."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,11 +1,9 @@
 """Drawn units and colours."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.pictures import GREY, Legend
+from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.building import Building, build
 from gsparc.apps.view.scene import EXTENT, Frame
 from gsparc.data.walls import SceneWalls
@@ -27,7 +25,9 @@ def test_one_place_is_a_site_too():
 def test_values_that_are_not_known_are_grey():
     legend = Legend.over("level", np.array([np.nan, 0.0, 1.0, np.inf]))
     found = legend.of(np.array([np.nan, 0.0, 1.0, 5.0]))
-    assert tuple(found[0]) == GREY and (found[2] == found[3]).all() and (found[1] != found[2]).any()
+    assert (
+        tuple(found[0]) == (170, 170, 170) and (found[2] == found[3]).all() and (found[1] != found[2]).any()
+    )
     assert Legend.over("nothing", np.full(3, np.nan)).high > Legend.over("nothing", np.full(3, np.nan)).low
 
 

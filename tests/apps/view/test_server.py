@@ -1,7 +1,5 @@
 """The server without a browser: a client whose scene and panel are viser's own."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import gc

@@ -1,7 +1,5 @@
 """A run that goes on from another one has its settings; a job that a launcher lost is said."""
 
-from __future__ import annotations
-
 import pytest
 
 from gsparc.commands.shared.cli import _message_of
@@ -18,16 +16,13 @@ def test_a_launcher_s_lost_job_is_said_with_what_to_do():
 HYDRA = "hydra: {runtime: {cwd: WHERE}}"
 
 
-@pytest.mark.parametrize(
-    ("words", "kept"),
-    [
-        ([], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "+trainer.x=1", "hydra.mode=RUN"]),
-        (["model.steps=7"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
-        (["model=gp"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
-        (["dataset=rfid", "-m"], ["model.steps=5", "+trainer.x=1"]),
-        (["~trainer.x"], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "hydra.mode=RUN"]),
-    ],
-)
+@pytest.mark.parametrize(("words", "kept"), [
+    ([], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "+trainer.x=1", "hydra.mode=RUN"]),
+    (["model.steps=7"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
+    (["model=gp"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
+    (["dataset=rfid", "-m"], ["model.steps=5", "+trainer.x=1"]),
+    (["~trainer.x"], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "hydra.mode=RUN"]),
+])  # fmt: skip
 @pytest.mark.parametrize("of", ["run", "run/last.ckpt", "run/fold0/refit/last.ckpt"])
 def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
     """`ckpt_path=RUN` loaded the default data and model, and was refused for not being those of the run."""

@@ -1,7 +1,5 @@
 """What commands say at their end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from rich.table import Table

@@ -1,7 +1,5 @@
 """Two runs in one folder: the second is refused before it writes, whatever became of the first."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -45,11 +43,6 @@ def test_two_runs_in_one_directory(other, tmp_path):
     assert not (tmp_path / HOLDER).exists()
 
 
-def test_a_folder_of_a_multirun_is_held_too(other, tmp_path):
-    given = ["-m", "ckpt=none.ckpt", "eval_on=val,test", f"hydra.sweep.dir={tmp_path}"]
-    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "another run writes here")
-
-
 def test_training_from_python_took_no_lock(other, tmp_path):
     with pytest.raises(ValueError, match=f"another run writes here .process {other.pid}"):
         train(OmegaConf.create({}), tmp_path)
@@ -72,12 +65,13 @@ def test_a_released_folder_is_free(tmp_path):
     release()
 
 
-def test_folders_of_a_multiruns_jobs_are_held_with_it(other, tmp_path):
+@pytest.mark.parametrize("words", [
+    ["hydra.run.dir={0}/0_seed-0"], ["-m", "eval_on=val,test", "hydra.sweep.dir={0}"],
+    ["-m", "eval_on=val", "hydra.sweep.dir={1}", "hydra.sweep.subdir={2}"],
+])  # fmt: skip
+def test_folders_of_a_multirun_and_of_its_jobs_are_held(words, other, tmp_path):
     """A run into one of them passed, and a multirun wrote into the folder of a run that held it."""
-    given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path / '0_seed-0'}"]
-    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here")
-    given = ["-m", "ckpt=none.ckpt", "eval_on=val", f"hydra.sweep.dir={tmp_path.parent}"]
-    given += [f"hydra.sweep.subdir={tmp_path.name}"]
+    given = [word.format(tmp_path, tmp_path.parent, tmp_path.name) for word in (*words, "ckpt=none.ckpt")]
     assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here")
     assert not (tmp_path / ".hydra").exists()
 

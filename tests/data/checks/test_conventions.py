@@ -1,7 +1,5 @@
 """Files that follow other conventions than the schema's: named, and mended by the setting that is named."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -69,24 +67,17 @@ OF_CSI = {
     "zeros_unmeasured": (WIDE, lambda a: {"csi": a["csi"] * (np.arange(16) != 8)}),
     "reverse_antennas": (LONG, lambda a: {"csi": a["csi"][:, ::-1]}),
     "exchange_axes": (LONG, lambda a: {"csi": a["csi"].swapaxes(1, 2)}),
-    "exchange_array": (
-        SQUARE,
-        lambda a: {"csi": a["csi"].reshape(ROWS, 4, 4, -1).swapaxes(1, 2).reshape(a["csi"].shape)},
-    ),
+    "exchange_array": (SQUARE,
+        lambda a: {"csi": a["csi"].reshape(ROWS, 4, 4, -1).swapaxes(1, 2).reshape(a["csi"].shape)}),
     "array_mm": (SQUARE, lambda a: {"array_position": a["array_position"] * 1000}),
-    "array_wavelengths": (
-        SQUARE,
-        lambda a: {"array_position": a["array_position"] * a["frequency_hz"].mean() / LIGHT},
-    ),
-}
+    "array_wavelengths": (SQUARE,
+        lambda a: {"array_position": a["array_position"] * a["frequency_hz"].mean() / LIGHT}),
+}  # fmt: skip
 OF_SPECTRA = {
-    "zenith": lambda v: v[:, ::-1],
-    "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
-    "azimuth_180": lambda v: np.roll(v, 18, axis=2),
-    "azimuth_north": lambda v: np.roll(v, -9, axis=2),
-    "transposed": lambda v: v.swapaxes(1, 2),
-    "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
-}
+    "zenith": lambda v: v[:, ::-1], "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
+    "azimuth_180": lambda v: np.roll(v, 18, axis=2), "azimuth_north": lambda v: np.roll(v, -9, axis=2),
+    "transposed": lambda v: v.swapaxes(1, 2), "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
+}  # fmt: skip
 
 
 def settings(warnings: list[str]) -> list[str]:

@@ -1,7 +1,5 @@
 """One wrong row among many: named, without a say in scales, left out when asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
@@ -97,10 +95,8 @@ def test_real_dynamics_are_no_outliers():
     """Free space from 3 cm to 30 m is 60 dB, and a silent half leaves nothing suspicious."""
     distance = np.geomspace(0.03, 30, 200)
     assert not too_strong(1 / distance).any()
-    assert (
-        not too_strong(np.where(np.arange(200) % 2, 1 / distance, 0)).any()
-        and not too_strong(np.zeros(9)).any()
-    )
+    assert not too_strong(np.where(np.arange(200) % 2, 1 / distance, 0)).any()
+    assert not too_strong(np.zeros(9)).any()
     assert too_strong(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
     track = np.stack([np.linspace(0, 5e3, 300), np.zeros(300), np.zeros(300)], 1)
     assert not too_far(track).any() and not too_far(np.zeros((5, 3))).any()

@@ -31,13 +31,9 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     """Links of a wide table: places (S, d), levels (S, T), stations (T, d)."""
     rows, count = level_db.shape
     return LinkLevels(
-        np.repeat(position, count, axis=0),
-        np.tile(np.arange(count), rows),
-        level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)],
-        names,
-        station_position,
-    )
+        np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
+        [f"row {i // count}" for i in range(rows * count)], names, station_position,
+    )  # fmt: skip
 
 
 def warnings_of(levels: LinkLevels | None):
@@ -94,17 +90,14 @@ def test_sound_degrees():
     assert plausibility.degree_warnings(np.array([40.7, -33.9]), np.array([-111.8, 151.2])) == []
 
 
-@pytest.mark.parametrize(
-    "level, said",
-    [
-        (lambda v: 10 ** (v / 10), "linear power? then give it as rssi"),
-        (lambda v: -v + 40, "all positive: losses, percent, or linear?"),
-        (lambda v: np.round((v + 100) / 2), "whole numbers from"),
-        (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-        (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
-        (lambda v: v * 0 - 3, "all levels are -3 dB"),
-    ],
-)
+@pytest.mark.parametrize("level, said", [
+    (lambda v: 10 ** (v / 10), "linear power? then give it as rssi"),
+    (lambda v: -v + 40, "all positive: losses, percent, or linear?"),
+    (lambda v: np.round((v + 100) / 2), "whole numbers from"),
+    (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
+    (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
+    (lambda v: v * 0 - 3, "all levels are -3 dB"),
+])  # fmt: skip
 def test_levels(level, said):
     found = plausibility.level_warnings(level(room()[1]))
     assert len(found) == 1 and said in found[0], found

@@ -1,7 +1,5 @@
 """The split that `gsparc check` proposes can be cut, and asks about holes wider than the places are apart."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.data.checks.describe import held_out, proposal, side_of_squares

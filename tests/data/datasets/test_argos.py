@@ -1,7 +1,5 @@
 """The Argos layout: what is read, what is refused, and what aligning may not change."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Layouts of measured campaigns: what is read and measured, and what is refused with array and row."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np
@@ -81,24 +79,18 @@ def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
 
 TECHTILE = {
     "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc: csi_imag, rover_z missing in a Techtile"),
-    "one experiment of two": (
-        {"csi_real": (("h", "c"), np.zeros((3, 8)))},
-        "csi.nc, csi_imag: expected shape (E, C, H)",
-    ),
+    "one experiment of two": ({"csi_real": (("h", "c"), np.zeros((3, 8)))},
+        "csi.nc, csi_imag: expected shape (E, C, H)"),
     "transposed": (
         {"csi_imag": (("h", "c", "e"), np.zeros((3, 8, 2)))},
         "csi.nc, csi_imag: expected shape (E, C, H) with E = 2 as in csi_real, C = 8 as in csi_real, "
         "H = 3 as in csi_real, found (3, 8, 2); transposed?",
     ),
-    "another host": (
-        {"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
-        "techtile_antenna_locations.yml: no antenna of the tiles G99",
-    ),
-    "no position": (
-        {"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
-        "csi.nc: no cycle has both a position and a channel",
-    ),
-}
+    "another host": ({"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
+        "techtile_antenna_locations.yml: no antenna of the tiles G99"),
+    "no position": ({"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
+        "csi.nc: no cycle has both a position and a channel"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", TECHTILE)
@@ -113,21 +105,18 @@ def test_spoilt_techtile_releases(tmp_path, refused, case):
 ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("antennes: 3", "expected `antennes:` with a list"),
-        ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
-        *(
+@pytest.mark.parametrize(("text", "says"), [
+    ("antennes: 3", "expected `antennes:` with a list"),
+    ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
+    *(
             (
                 "antennes:\n" + "".join(f"- {{tile: {h}, {c}}}\n" for h in HOSTS),
                 "A05: expected x, y, z [m] of channel 1",
             )
             for c in (ONE_CHANNEL, NAN_CHANNEL)
         ),
-        ("[1, 2", "not readable as YAML"),
-    ],
-)
+    ("[1, 2", "not readable as YAML"),
+])  # fmt: skip
 def test_spoilt_tables_of_antennas(tmp_path, refused, text, says):
     path = write_release(tmp_path)
     (tmp_path / "techtile_antenna_locations.yml").write_text(text)
@@ -224,17 +213,14 @@ def test_absent_damaged_and_foreign_files(tmp_path, refused, name):
     refused("position: missing", LOADERS[name], foreign)
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"max_row": 9}, "dataset.max_row: no such setting of dataset=ble; did you mean 'max_rows'?"),
-        ({"max_rows": 1}, "dataset.max_rows=1: a whole number of at least 2"),
-        ({"stations": []}, "dataset.stations=[]: a list of names like [A,B]"),
-        ({"min_rssi_db": "x"}, "dataset.min_rssi_db='x': a number"),
-        ({"file": None}, "dataset.file is not set; .*say dataset.file=FILE for dataset=ble"),
-        ({"root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
-    ],
-)
+@pytest.mark.parametrize(("settings", "says"), [
+    ({"max_row": 9}, "dataset.max_row: no such setting of dataset=ble; did you mean 'max_rows'?"),
+    ({"max_rows": 1}, "dataset.max_rows=1: a whole number of at least 2"),
+    ({"stations": []}, "dataset.stations=[]: a list of names like [A,B]"),
+    ({"min_rssi_db": "x"}, "dataset.min_rssi_db='x': a number"),
+    ({"file": None}, "dataset.file is not set; .*say dataset.file=FILE for dataset=ble"),
+    ({"root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
+])  # fmt: skip
 def test_settings_that_cannot_be(tmp_path, refused, settings, says):
     refused(says, datamodule, {"name": "ble", "file": str(write_npz(tmp_path, "ble")), **settings})
 
@@ -269,12 +255,10 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
 
 
 MEASURED = [
-    ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4),
-    ("powder-rss-462mhz.npz", "powder", None),
-    ("ble-hall-1.npz", "ble", 81 * 12),
-    ("ble-hall-2.npz", "ble", 45 * 12),
+    ("techtile-csi-920mhz.npz", "techtile", 1015 * 42 - 4), ("powder-rss-462mhz.npz", "powder", None),
+    ("ble-hall-1.npz", "ble", 81 * 12), ("ble-hall-2.npz", "ble", 45 * 12),
     ("techtile-power-reci-rf-1.npz", None, 20382),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("file", "campaign", "rows"), MEASURED)

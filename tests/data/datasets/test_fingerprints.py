@@ -1,7 +1,5 @@
 """Fingerprints from archives and tables, what is refused, and how rows are parted."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from releases import real

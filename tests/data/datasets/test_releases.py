@@ -1,8 +1,6 @@
 """Files as their makers published them, beside what was converted from them."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import pickle
 import sys
 from pathlib import Path
@@ -40,15 +38,12 @@ def frame(rows: int = 8, **changed):
 
     rng = np.random.default_rng(0)
     columns = {
-        "TxPos": [np.array([-1.5, 0, 1.7])] * rows,
-        "RxPos": [*rng.uniform(0, 3, (rows, 3))],
-        "CSI": [*(rng.normal(size=(rows, 1)) + 1j)],
-        "Frequency": [2.412] * rows,
+        "TxPos": [np.array([-1.5, 0, 1.7])] * rows, "RxPos": [*rng.uniform(0, 3, (rows, 3))],
+        "CSI": [*(rng.normal(size=(rows, 1)) + 1j)], "Frequency": [2.412] * rows,
         "LastXPts": [rng.normal(size=(3, 4)) for _ in range(rows)],
         "RxChanPerRay": [rng.normal(size=(4, 1)) + 0j for _ in range(rows)],
-        "LineOfSight": np.ones(rows, np.uint8),
-        **changed,
-    }
+        "LineOfSight": np.ones(rows, np.uint8), **changed,
+    }  # fmt: skip
     heads = pandas.Index(list(columns), dtype=object)
     return pandas.DataFrame({name: pandas.Series(columns[name]) for name in heads}).set_axis(heads, axis=1)
 
@@ -103,10 +98,8 @@ def test_a_pickle_runs_nothing(tmp_path, monkeypatch, case):
 @pytest.mark.parametrize("protocol", range(6))
 def test_pickled_arrays_of_every_protocol(tmp_path, protocol):
     held = {
-        "a": np.arange(6.0).reshape(2, 3),
-        "b": np.array([np.ones(2), "x", None], object),
-        "c": np.float32(2),
-    }
+        "a": np.arange(6.0).reshape(2, 3), "b": np.array([np.ones(2), "x", None], object), "c": np.float32(2),
+    }  # fmt: skip
     (tmp_path / "x.pkl").write_bytes(pickle.dumps(held, protocol))
     found = unpickled(tmp_path / "x.pkl", FRAMES)
     assert np.array_equal(found["a"], held["a"]) and found["c"] == 2 and found["b"][1] == "x"
@@ -223,9 +216,8 @@ def test_techtile_power_of_pickled_objects(tmp_path, caplog):
     folder = plane(tmp_path / "RECI-RF-1", np.eye(4, 3) + 3, [58_600_000.0, 1e6, 1e9, 0])
     arrays = raw_of_techtile_power(folder).arrays
     assert np.allclose(arrays["rssi_db"], [-12.321, -30, 0], atol=1e-3)  # of 58.6, 1 and 1,000 microwatts
-    assert (
-        np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3)) and arrays["frequency_hz"] == 920e6
-    )
+    assert np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3))
+    assert arrays["frequency_hz"] == 920e6
     assert (
         "dataset=techtile_power"
         in read_any(plane(tmp_path / "b", np.random.rand(20, 3), [1e6] * 20)).notes[0]

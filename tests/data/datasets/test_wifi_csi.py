@@ -1,7 +1,5 @@
 """Logs of Wi-Fi cards with a table of places: subcarriers, levels and places of each packet."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from pathlib import Path

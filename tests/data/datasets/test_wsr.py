@@ -1,8 +1,6 @@
 """Logs of both ends of a Wi-Fi link: squares of the channel, their root along the way."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -47,16 +47,13 @@ def test_the_origin_is_the_rounded_median():
     assert pickle.loads(pickle.dumps(origin)) == origin
 
 
-@pytest.mark.parametrize(
-    "latitude, longitude, said",
-    [
-        (91, 0, "latitude 91 is outside -90 to 90"),
-        (-111.8, 40.7, "are latitude and longitude swapped"),
-        (0, 400, "longitude 400"),
-        (np.nan, 0, "latitude nan"),
-        (0, np.inf, "longitude inf"),
-    ],
-)
+@pytest.mark.parametrize("latitude, longitude, said", [
+    (91, 0, "latitude 91 is outside -90 to 90"),
+    (-111.8, 40.7, "are latitude and longitude swapped"),
+    (0, 400, "longitude 400"),
+    (np.nan, 0, "latitude nan"),
+    (0, np.inf, "longitude inf"),
+])  # fmt: skip
 def test_what_is_not_on_earth_is_refused(latitude, longitude, said):
     with pytest.raises(DataError, match=said):
         Georeference(latitude, longitude)

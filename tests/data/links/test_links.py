@@ -1,7 +1,5 @@
 """Stations, both ends moving, missing and censored powers: what a file may say, and what it becomes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -21,11 +19,9 @@ LONG = {"tx_position": np.repeat(WALK, STATIONS, axis=0), "station": np.tile(np.
 def town(**changes):
     """Powers of a walking transmitter at three stations, one column for each."""
     arrays = {
-        "tx_position": WALK,
-        "station_position": POSTS,
-        "station_name": np.array(["north", "east", "roof"]),
+        "tx_position": WALK, "station_position": POSTS, "station_name": np.array(["north", "east", "roof"]),
         "rssi_db": LEVELS,
-    }
+    }  # fmt: skip
     return {k: np.asarray(v) for k, v in {**arrays, **changes}.items() if v is not None}
 
 
@@ -201,15 +197,11 @@ OF_ROWS = [
         },
         "rssi_db, row 7: not finite",
     ),
-    (
-        town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
-        "rssi_db, row 17, station roof: not finite",
-    ),
-    (
-        town(rssi_db=changed(LEVELS, ((4, 1), -120)), sensitivity_db=np.array(-100.0)),
-        "row 4, station east: rssi_db is -120, below -100",
-    ),
-]
+    (town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
+        "rssi_db, row 17, station roof: not finite"),
+    (town(rssi_db=changed(LEVELS, ((4, 1), -120)), sensitivity_db=np.array(-100.0)),
+        "row 4, station east: rssi_db is -120, below -100"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arrays", "says"), OF_ROWS)

@@ -1,7 +1,5 @@
 """A station whose level steps is another one from there on; nothing else changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -74,15 +72,12 @@ def unplaced() -> Raw:
     return Raw({"rx_position": np.eye(4)[:, :3], "tx_position": np.ones(3), "rssi_db": np.zeros(4)})
 
 
-@pytest.mark.parametrize(
-    ("make", "steps", "says"),
-    [
-        (wide, {"c": (5,)}, "no station c in file"),
-        (wide, {"b": (12,)}, "expected a row between 1 and 11"),
-        (wide, {"b": (0,)}, "expected a row between 1 and 11"),
-        (unplaced, {"b": (2,)}, "has no stations"),
-    ],
-)
+@pytest.mark.parametrize(("make", "steps", "says"), [
+    (wide, {"c": (5,)}, "no station c in file"),
+    (wide, {"b": (12,)}, "expected a row between 1 and 11"),
+    (wide, {"b": (0,)}, "expected a row between 1 and 11"),
+    (unplaced, {"b": (2,)}, "has no stations"),
+])  # fmt: skip
 def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
     refused(says, split_stations, make(), steps, "file")
 

@@ -1,8 +1,6 @@
 """Public data from a local server: what comes, what is refused in one line, and what is kept."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-from __future__ import annotations
-
 import csv
 import os
 import signal
@@ -118,11 +116,9 @@ def test_a_file_that_is_not_the_pinned_one_is_said_and_not_kept(mirror, monkeypa
     answer, says = FAULTS[case]
     first = mirror.serve("release/first.csv", TWO)
     offer(
-        monkeypatch,
-        tmp_path,
-        first,
+        monkeypatch, tmp_path, first,
         mirror.serve("release/1.bin", ONE, *[answer] * (40 if answer is moved else 1)),
-    )
+    )  # fmt: skip
     with pytest.raises(DataError, match=says) as error:
         fetch("room", timeout_s=0.3, retries=0)
     assert "\n" not in str(error.value) and "release/1.bin" in str(error.value)

@@ -1,7 +1,5 @@
 """Which cells there are, and in which order."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
@@ -81,19 +79,11 @@ def test_every_method_of_the_default_comparison_composes():
         assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
 
 
-@pytest.mark.parametrize(
-    ("group", "of", "entry", "message"),
-    [
-        (
-            "methods",
-            Contender,
-            {"chose": ["model=gp"]},
-            r"methods\.x: unknown 'chose'; there are choose",
-        ),
-        ("methods", Contender, {}, r"methods\.x: missing 1 required positional argument: 'choose'"),
-        ("splits", SplitChoice, {"draw": 3}, r"splits\.x: unknown 'draw'; there are choose, datasets, draws"),
-    ],
-)
+@pytest.mark.parametrize(("group", "of", "entry", "message"), [
+    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x: unknown 'chose'; there are choose"),
+    ("methods", Contender, {}, r"methods\.x: missing 1 required positional argument: 'choose'"),
+    ("splits", SplitChoice, {"draw": 3}, r"splits\.x: unknown 'draw'; there are choose, datasets, draws"),
+])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
         named(group, of, {"x": entry})

@@ -1,7 +1,5 @@
 """Errors disturb only what they are said to disturb, and every variant sees the same ones."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

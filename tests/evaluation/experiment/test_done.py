@@ -1,7 +1,5 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -53,16 +51,13 @@ def cut_short(folder, name="last.ckpt"):
     return work
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"settings": {"seed": 1}},
-        {"files": {"init.file": "0"}},
-        {"data": "e"},
-        {"split": "t"},
-        {"program": "q"},
-    ],
-)
+@pytest.mark.parametrize("other", [
+    {"settings": {"seed": 1}},
+    {"files": {"init.file": "0"}},
+    {"data": "e"},
+    {"split": "t"},
+    {"program": "q"},
+])  # fmt: skip
 def test_a_cell_is_done_once_in_one_state(tmp_path, other):
     assert once(tmp_path, state(), ends(tmp_path, 1)) == once(tmp_path, state(), ends(tmp_path, 2))
     assert finished(tmp_path, state(**other)) is None
@@ -146,6 +141,23 @@ def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
     (tmp_path / "moved").mkdir()
     moved = file.rename(tmp_path / "moved" / file.name)
     assert of(moved) == after  # where the file is does not matter
+
+
+def test_a_job_found_done_read_its_data_first(tmp_path):
+    """Seconds for each job of a sweep said again; files of the same bytes say the same."""
+    file, read = spectra(tmp_path / "own.npz"), state()
+    configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
+    unread, same, other = map(State.unread, configs)
+    once(tmp_path, read, ends(tmp_path), unread=unread)
+    assert finished(tmp_path, same) == {"value": 1} and finished(tmp_path, other) is None
+    with file.open("ab") as stream:
+        stream.write(b" ")
+    assert finished(tmp_path, State.unread(configs[0])) is None
+    release = compose("dataset=rfid", f"dataset.root='{tmp_path}'", "model=mean")
+    before = State.unread(release)
+    (tmp_path / "more.txt").touch()
+    assert before and before != State.unread(release)
+    assert State.unread(compose("dataset=rfid", "dataset.root=null", "model=mean")) is None
 
 
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):

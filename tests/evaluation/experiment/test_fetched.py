@@ -1,7 +1,5 @@
 """A comparison of what was fetched: it needs no path."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

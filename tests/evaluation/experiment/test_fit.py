@@ -1,7 +1,5 @@
 """Folds of a split, fitted here and in other processes."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Cells of a comparison: what names one, what is found again, what is not."""
 
-from __future__ import annotations
-
 import errno
 import json
 

@@ -1,7 +1,5 @@
 """Slow methods do not stretch the rounds of the fast ones, and the slowest are timed once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -55,11 +55,9 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             split = split_for(plain(config.split), data)
             folder = Path(mkdtemp())
             fits = fit_folds(
-                partial(deepcopy, method),
-                data,
-                split,
+                partial(deepcopy, method), data, split,
                 [context_of(config, run_dir=folder)] * len(split.folds),
-            )
+            )  # fmt: skip
             method, rows = fits.methods[0], split.folds[0].test
             method.predict(data.batch(rows[:1]))
         unused = options.unheeded(reads, method, data) or ""
@@ -70,27 +68,17 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
 
 # Options of which a plain method heeds those of the split alone.
 TRAINING = {
-    "trainer.val_check_interval": 2,
-    "callbacks.densify.min_gaussians": 5,
-    "callbacks.reset.ceiling": 0.02,
+    "trainer.val_check_interval": 2, "callbacks.densify.min_gaussians": 5, "callbacks.reset.ceiling": 0.02,
     "dataset.batch_size": 7,
-}
+}  # fmt: skip
 OF_RUN = {"budget_s": 4, "stations": "each", "split.redraw": "true", **TRAINING}
 SPLIT = {"split.test_fraction": 0.25, "split.thin": 0.9}
 FIELD = {
-    "trainer.max_steps": 4,
-    "model.field.count": 40,
-    "model.field.near": 1.5,
-    "model.field.margin": 1.0,
-    "model.emission.encoding.anchors": 20,
-    "model.emission.init_scale": 0.2,
-    "model.attenuation.gain": 3.0,
-    "model.raster.low_pass": 0.2,
-    "model.loss.ssim_weight": 0.3,
-    "model.optimizer.emission": 0.01,
-    "model.confidence.alpha": 0.2,
-    "model.refit": "false",
-}
+    "trainer.max_steps": 4, "model.field.count": 40, "model.field.near": 1.5, "model.field.margin": 1.0,
+    "model.emission.encoding.anchors": 20, "model.emission.init_scale": 0.2, "model.attenuation.gain": 3.0,
+    "model.raster.low_pass": 0.2, "model.loss.ssim_weight": 0.3, "model.optimizer.emission": 0.01,
+    "model.confidence.alpha": 0.2, "model.refit": "false",
+}  # fmt: skip
 INIT = {"init.searches": 2, "init.rows": 500}
 ALL_FIELD = set(FIELD) | set(TRAINING)  # what a process that has all the weight, or a closed form, leaves
 NEVER = {"callbacks.densify.min_gaussians", "callbacks.reset.ceiling"}  # of trainings of four steps
@@ -98,11 +86,9 @@ SPHERE = {"model.field.margin", "model.attenuation.gain"}
 BOX = {"model.field.near", "model.attenuation.gain"}
 SSIM = {"model.loss.ssim_weight"}
 PLAIN = {
-    "nearest": {},
-    "kriging": {},
-    "idw": {"model.neighbours": 4, "model.power": 1.0},
+    "nearest": {}, "kriging": {}, "idw": {"model.neighbours": 4, "model.power": 1.0},
     "gp": {"model.components": 3, "model.mean": "constant"},
-}
+}  # fmt: skip
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 OTHER = {  # values to perturb options by
     "trainer.val_check_interval": 3, "callbacks.densify.min_gaussians": 8, "callbacks.reset.ceiling": 0.04,

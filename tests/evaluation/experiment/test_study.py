@@ -1,7 +1,5 @@
 """Each variant's accuracy, seconds and milliseconds beside the base's, under every condition of the data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from clocks import WoundClock

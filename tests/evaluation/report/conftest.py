@@ -1,7 +1,5 @@
 """Run directories as training leaves them, invented."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A sweep ends in one table and one figure; a failed job is said at once and takes none along."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Tables say what the runs left, with intervals that cover and times beside."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -31,14 +29,11 @@ def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
 
 
-@pytest.mark.parametrize(
-    ("folder", "text", "message"),
-    [
-        ("absent", None, "absent: no such directory"),
-        ("empty", None, "empty: no run in it"),
-        ("damaged", "{", "summary.json: cannot be read as a summary"),
-    ],
-)
+@pytest.mark.parametrize(("folder", "text", "message"), [
+    ("absent", None, "absent: no such directory"),
+    ("empty", None, "empty: no run in it"),
+    ("damaged", "{", "summary.json: cannot be read as a summary"),
+])  # fmt: skip
 def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
     if folder != "absent":
         (tmp_path / folder).mkdir()
@@ -53,12 +48,8 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
     row = cells(table, 0)
     assert row["PSNR dB"].value == 28.0 and row["PSNR dB"].low < 28.0 < row["PSNR dB"].high
     assert row["train s"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
-    assert (
-        row["Gaussians"] == 500
-        and row["effects"] == "none"
-        and row["data"] == "d" * 8
-        and row["commit"] == "c" * 8
-    )
+    assert row["Gaussians"] == 500 and row["effects"] == "none" and row["data"] == "d" * 8
+    assert row["commit"] == "c" * 8
     named = [r[0] for r in table.rows]
     assert named[3:] == ["mean", "gp"] and cells(table, 4)["query ms p50"] == 0.7
 
@@ -82,7 +73,7 @@ def test_an_interval_covers_as_often_as_it_says():
 def test_an_interval_of_a_ratio_weighs_samples(three):
     low, high = bootstrap(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
     assert low == high == pytest.approx(0.1)
-    assert interval(find_runs(three)[0], "no_such_figure") is None
+    assert interval(find_runs(three)[0].row, "no_such_figure") is None
 
 
 def test_time_to_accuracies_and_best_within_minutes(three):
@@ -135,10 +126,8 @@ def test_a_table_survives_csv_and_markdown():
     lines = [["a|b", Interval(1.25, 1.0, 2.0), 3], ["c", None, None]]
     table = Table("T", [Column("name"), Column("x", ".1f"), Column("n", "d")], lines, "note")
     rows = list(csv.DictReader(io.StringIO(table.csv())))
-    assert (
-        rows[0] == {"name": "a|b", "x": "1.25", "x low": "1.0", "x high": "2.0", "n": "3"}
-        and rows[1]["x"] == ""
-    )
+    assert rows[0] == {"name": "a|b", "x": "1.25", "x low": "1.0", "x high": "2.0", "n": "3"}
+    assert rows[1]["x"] == ""
     text = table.markdown()
     assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | – | – |" in text and "note" in text
 
@@ -146,14 +135,13 @@ def test_a_table_survives_csv_and_markdown():
 def test_columns_keep_text_as_text(tmp_path):
     (tmp_path / "x.csv").write_text("a,b\n1,x\n,y\n")
     found = columns(tmp_path / "x.csv")
-    assert (
-        np.isnan(found["a"][1]) and found["b"].tolist() == ["x", "y"] and columns(tmp_path / "none.csv") == {}
-    )
+    assert np.isnan(found["a"][1]) and found["b"].tolist() == ["x", "y"]
+    assert columns(tmp_path / "none.csv") == {}
 
 
 def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
-    assert find_runs(three[:1])[0].latency[0] == 0.1 and find_runs(three[1:2])[0].latency[0] == 0.5
+    assert [run.row["query_ms"] for run in find_runs(three[:2])] == [0.1, 0.5]
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
 
 

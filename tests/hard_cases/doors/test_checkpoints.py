@@ -52,17 +52,13 @@ def payloads(mark: Path) -> dict[str, object]:
     """Objects whose unpickling by an ordinary unpickler touches `mark`."""
     code = f"open({str(mark)!r}, 'w')"
     return {
-        "os.system": Calls(os.system, f"touch {mark}"),
-        "eval": Calls(eval, code),
-        "exec": Calls(exec, code),
+        "os.system": Calls(os.system, f"touch {mark}"), "eval": Calls(eval, code), "exec": Calls(exec, code),
         "open": Calls(builtins.open, str(mark), "w"),
-        "subprocess": Calls(subprocess.call, ["touch", str(mark)]),
-        "Path.touch": Calls(Path.touch, mark),
-        "torch.save": Calls(torch.save, {}, str(mark)),
-        "numpy.save": Calls(np.save, str(mark), np.ones(1)),
+        "subprocess": Calls(subprocess.call, ["touch", str(mark)]), "Path.touch": Calls(Path.touch, mark),
+        "torch.save": Calls(torch.save, {}, str(mark)), "numpy.save": Calls(np.save, str(mark), np.ones(1)),
         "getattr": Calls(getattr, Calls(__import__, "os"), "system"),
         "a class of ours": checkpoint.Stored("m", "t", "", None, {}),
-    }
+    }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +109,8 @@ def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
     path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)[name]})
     assert_refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
     given = [
-        "dataset=own",
-        f"dataset.file={sound[1]}",
-        f"ckpt_path={path}",
-        f"hydra.run.dir={tmp_path / 'r2'}",
-    ]
+        "dataset=own", f"dataset.file={sound[1]}", f"ckpt_path={path}", f"hydra.run.dir={tmp_path / 'r2'}",
+    ]  # fmt: skip
     answer = knock(train, "train.py", [*given, "logger=none", "threads=1", "model.effects.phase=false"])
     assert_refused(answer, "could run code", tmp_path / "r2")
     assert not (tmp_path / MARK).exists()

@@ -13,11 +13,9 @@ from gsparc.commands.train import main as train
 evaluate = COMMANDS["evaluate"].run
 
 SLIPS = {
-    "modle=gsparc": "did you mean 'model'",
-    "model=gsprac": "did you mean 'gsparc'",
+    "modle=gsparc": "did you mean 'model'", "model=gsprac": "did you mean 'gsparc'",
     "experiment=paper/rfdi": "experiment=paper/rfdi: no such choice; did you mean 'paper/rfid'",
-    "experiment=papr/rfid": "did you mean 'paper/rfid'",
-    "experiment=paperrfid": "did you mean 'paper/rfid'",
+    "experiment=papr/rfid": "did you mean 'paper/rfid'", "experiment=paperrfid": "did you mean 'paper/rfid'",
     "trainer.max_step=3": "did you mean 'trainer.max_steps'",
     "model.field.cout=4": "did you mean 'model.field.count'",
     "model.feild.count=4": "did you mean 'model.field'",
@@ -25,17 +23,13 @@ SLIPS = {
     "callbacks.pictres.every=1": "did you mean 'callbacks.pictures'",
     "+model.field.cout=3": "model.field.cout: no such setting of FieldSettings; did you mean 'model.field.c",
     "++model.emission.encoding.octavs=3": "of EncodingSettings; did you mean 'model.emission.encoding.oct",
-    "hydra.run.dri=x": "did you mean 'hydra.run.dir'",
-    "dataset.flie=x": "did you mean 'dataset.file'",
-    "dataset.name=onw": "did you mean 'own'",
-    "split.val_fracton=0.1": "did you mean 'split.val_fraction'",
+    "hydra.run.dri=x": "did you mean 'hydra.run.dir'", "dataset.flie=x": "did you mean 'dataset.file'",
+    "dataset.name=onw": "did you mean 'own'", "split.val_fracton=0.1": "did you mean 'split.val_fraction'",
     "eval_on=tset": "eval_on='tset': one of train, val, test is needed; did you mean 'test'",
-    "baselines=[gpp]": "'gpp' is none; did you mean 'gp'",
-    "lr=0.1": "lr: no such setting",
-}
+    "baselines=[gpp]": "'gpp' is none; did you mean 'gp'", "lr=0.1": "lr: no such setting",
+}  # fmt: skip
 VALUES = {
-    "seed=abc": "seed='abc': a whole number of at least 0",
-    "seed=-1": "seed=-1: a whole number",
+    "seed=abc": "seed='abc': a whole number of at least 0", "seed=-1": "seed=-1: a whole number",
     "budget_s=1min": "budget_s='1min': a number above 0, or null is needed",
     "trainer.accelerator=gpu": "trainer.accelerator=gpu: there is no GPU here; say trainer=cpu",
     "threads=0": "threads=0: a whole number of at least 1, or null",
@@ -44,13 +38,10 @@ VALUES = {
     "trainer.max_steps=-2": "trainer.max_steps=-2: a whole number of at least 0",
     "dataset.batch_size=true": "dataset.batch_size=True",
     "trainer.gradient_clip_val=-1": "trainer.gradient_clip_val=-1: a number above 0",
-    "trainer.accelerator=gpuu": "accelerator='gpuu'",
-    "model.field.count=-3": "model.field.count=-3",
+    "trainer.accelerator=gpuu": "accelerator='gpuu'", "model.field.count=-3": "model.field.count=-3",
     "model.field.opacity=1": "model.field.opacity=1: a number above 0 and below 1",
-    "model.field.scale=-0.1": "model.field.scale=-0.1",
-    "model.field.margin=inf": "model.field.margin=inf",
-    "init=spere": "did you mean 'sphere'",
-    "model.emission.activation=sigmoide": "did you mean 'sigmoid'",
+    "model.field.scale=-0.1": "model.field.scale=-0.1", "model.field.margin=inf": "model.field.margin=inf",
+    "init=spere": "did you mean 'sphere'", "model.emission.activation=sigmoide": "did you mean 'sigmoid'",
     "model.emission.hidden=-1": "model.emission.hidden=-1",
     "model.emission.encoding.kind=kernal": "model.emission.encoding.kind='kernal'",
     "model.emission.encoding.anchors=0": "anchors=0",
@@ -58,28 +49,21 @@ VALUES = {
     "model.attenuation.gain=-2": "model.attenuation.gain=-2",
     "model.attenuation.d_ref=nan": "model.attenuation.d_ref=nan",
     "model.raster.projection=tangents": "'tangent' or 'equirect'",
-    "model.raster.backend=gpu": "'reference', 'cpu' or 'cuda'",
-    "model.raster.low_pass=-1": "low_pass >= 0",
+    "model.raster.backend=gpu": "'reference', 'cpu' or 'cuda'", "model.raster.low_pass=-1": "low_pass >= 0",
     "model.raster.alpha_cutoff=2": r"cut-offs lie in \(0, 1\)",
     "model.loss.ssim_weight=nan": "model.loss.ssim_weight=nan",
     "model.optimizer.positions=-1": "model.optimizer.positions=-1: a number of at least 0",
     "model.optimizer.emission=inf": "model.optimizer.emission=inf",
-    "model.confidence.alpha=-1": "model.confidence.alpha=-1",
-    "model.confidence.clamp=1e4": "at most 80",
+    "model.confidence.alpha=-1": "model.confidence.alpha=-1", "model.confidence.clamp=1e4": "at most 80",
     "model.effects.phase=ture": "one of true, false, auto",
     "model.effects=off": "one by one: model.effects.image=..., model.effects.array=...",
-    "model.init=sources": "say init=sources",
-    "callbacks.densify=off": "null leaves it out",
-    "init.name=maybe": "one of auto, sphere",
-    "model.refit=perhaps": "one of true, false",
-    "model._target_=os.system": "'os.system'",
-    "split.val_fraction=2": "split.val_fraction=2",
-    "split.test_fraction=0": "split.test_fraction=0",
-    "split.thin=-1": "split.thin=-1",
+    "model.init=sources": "say init=sources", "callbacks.densify=off": "null leaves it out",
+    "init.name=maybe": "one of auto, sphere", "model.refit=perhaps": "one of true, false",
+    "model._target_=os.system": "'os.system'", "split.val_fraction=2": "split.val_fraction=2",
+    "split.test_fraction=0": "split.test_fraction=0", "split.thin=-1": "split.thin=-1",
     "dataset.file=": "dataset.file is not set",
-    "trainer.max_steps": "trainer.max_steps: not understood; write KEY=VALUE",
-    "=": "Could not override",
-}
+    "trainer.max_steps": "trainer.max_steps: not understood; write KEY=VALUE", "=": "Could not override",
+}  # fmt: skip
 CASES = {**SLIPS, **VALUES}
 QUICK = ("modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
          "seed=abc", "model.attenuation.d_min=0", "eval_on=tset", "model.effects=off")  # fmt: skip
@@ -101,17 +85,14 @@ def test_train(slip, file, tmp_path):
     assert_refused(knock(train, "train.py", [*good, slip]), CASES[slip], tmp_path)
 
 
-@pytest.mark.parametrize(
-    "slip,says",
-    [
-        ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
-        ("eval_onn=val", "did you mean 'eval_on'"),
-        ("eval_on=vall", "did you mean 'val'"),
-        ("threads=-2", "threads=-2"),
-        ("baselines=[nearst]", "did you mean 'nearest'"),
-        ("dataset.rot=x", "did you mean 'dataset.root'"),
-    ],
-)
+@pytest.mark.parametrize("slip,says", [
+    ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
+    ("eval_onn=val", "did you mean 'eval_on'"),
+    ("eval_on=vall", "did you mean 'val'"),
+    ("threads=-2", "threads=-2"),
+    ("baselines=[nearst]", "did you mean 'nearest'"),
+    ("dataset.rot=x", "did you mean 'dataset.root'"),
+])  # fmt: skip
 def test_evaluate(slip, says, tmp_path):
     given = [f"hydra.run.dir={tmp_path}", "ckpt=absent.ckpt", slip]
     assert_refused(knock(evaluate, "evaluate", given), says, tmp_path)

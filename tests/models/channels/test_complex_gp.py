@@ -94,7 +94,7 @@ def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):
         errors.append(nmse(found, np.exp(1j * asked @ waves.T) @ power))
     assert any("nearest of 50 places, of 400 rows" in note for note in notes)
     assert errors[1] < 1.5 * errors[0] < 0.2, errors
-    assert len(method.first) == 50 and (np.diff(method.first) > 0).all()
+    assert len(method.posterior.places) == 50
 
 
 def _in_runs(factors, seed=0):
@@ -119,9 +119,7 @@ def test_runs_are_brought_together(tmp_path):
             assert notes[1].startswith(
                 "complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: "
             )
-            known = np.concatenate([fold.train, fold.val])
-            found = [method.turned.numpy()[spread.run[known] == number][0] for number in (5, 6, 7)]
-            ratio = np.array(found) / factors
+            ratio = method.runs.of(torch.tensor([5, 6, 7])).numpy() / factors
             assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
             again = _restored(method, data.site, tmp_path)
             torch.testing.assert_close(again.predict(batch).mean, method.predict(batch).mean)

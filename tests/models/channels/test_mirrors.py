@@ -5,19 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from closed import fitted_to, read_back
+from closed import conditioned, fitted_to, read_back
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.models.channels.columns import gather
-from gsparc.models.channels.covariance import Shape, Values, disturbance, mirrored, signals
 from gsparc.models.channels.evidence import compressed, normalised
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.mirrors import find_mirrors
+from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe
+from gsparc.models.channels.terms import Direct, Images, Isotropic, Noise
+from gsparc.models.channels.terms.term import Frame
 from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import reflect
 from gsparc.simulate.shoebox import Room, images
@@ -54,20 +56,19 @@ def _data(end, place, channel, carrier=299792458.0 / WAVELENGTH):
 
 
 def _bare(data):
-    """Groups, shape and values of a direct wave in a diffuse field."""
+    """Groups, and a direct wave in a diffuse field."""
     groups = tuple(normalised(group) for group in gather(data, np.arange(len(data)), True))
-    none, middle = torch.zeros(0, 3, dtype=torch.float64), torch.from_numpy(data.moving).mean(0)
-    shape = Shape(none, 8.0, False, True, False, middle, 20.0)
-    power, offset = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64), torch.zeros(3).double()
-    envelope, gain = torch.tensor([2.0, 0.8], dtype=torch.float64)
-    return groups, Values(**shape.state(), power=power, envelope=envelope, gain=gain, offset=offset)
+    frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 2.0, 0.8, torch.zeros(3).double())
+    power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
+    terms = Isotropic(frame, power[:1]), Direct(frame, power[1:3]), Noise(frame, power[3:])
+    return groups, ChannelPrior(terms)
 
 
 def test_a_probe_gains_what_the_likelihood_rises():
-    groups, values = _bare(_data(*_site([WALL], ends=1)))
+    groups, prior = _bare(_data(*_site([WALL], ends=1)))
     group, level = groups[0], 0.2
-    probe = Probe.of(compressed(groups, values)[0], values.power)
-    covariance = signals(groups, values)[0] + disturbance(values, group)
+    probe = Probe.of(compressed(groups, prior)[0], prior)
+    covariance = prior.of_groups(groups)[0] + prior.disturbance(group)
     waves = torch.randn(2, len(group), dtype=torch.complex128, generator=torch.manual_seed(0))
     for _ in range(2):  # alone, then beside the first
         for wave, gain in zip(waves, probe.gain(waves, level), strict=True):
@@ -84,9 +85,9 @@ def test_a_probe_gains_what_the_likelihood_rises():
 
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
     data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
-    groups, values = _bare(data)
-    parts = compressed(groups, values)
-    planes, _ = find_mirrors(parts, parts, values, WAVELENGTH, 1)
+    groups, prior = _bare(data)
+    parts = compressed(groups, prior)
+    planes = find_mirrors(parts, parts, prior, WAVELENGTH, 1)
     plane = planes[0].numpy() * np.sign(planes[0, 0].item())
     assert np.arccos(plane[:3] @ WALL[:3]) < 0.05
     assert plane[3] + plane[:3] @ data.site.origin == pytest.approx(WALL[3], abs=0.05)
@@ -97,22 +98,22 @@ def test_no_wall_is_kept_where_there_is_none():
     field, _ = fitted_to(
         ChannelField(ChannelSettings(mirrors=2, directions=False)), data, np.arange(len(data))
     )
-    assert field.values.sequences == () and not len(field.objects().planes)
+    assert field.prior.get(Images) is None and not len(field.objects().planes)
 
 
 def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
     plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
-    end, middle = torch.tensor([1.0, 0, 0]).double(), torch.zeros(3).double()
-    assert mirrored(plane, ((0,), (1,), (1, 0)), end, middle).tolist() == [0.0, 1.0, 0.0]
+    (group, *_), prior = _bare(_data(*_site([WALL], ends=1)))
+    frame, slot = replace(prior.frame, middle=torch.zeros(3).double()), replace(group.slot, end=plane[0, :3])
+    waves = Images.of(frame, plane).waves(replace(group, slot=slot))
+    assert waves.abs().sum(1).bool().tolist() == [False, True]
 
 
 def test_planes_outlive_storing():
     data = _data(*_site([WALL], count=40))
-    _, values = _bare(data)
+    _, prior = _bare(data)
     wall = torch.from_numpy(WALL - np.r_[0, 0, 0, WALL[:3] @ data.site.origin])[None]
-    power = torch.tensor([0.1, 0.5, 0.02, 0.3, 0.01, 0.01], dtype=torch.float64)
-    field = ChannelField.of(data.site, replace(values, sequences=((0,),), power=power, planes=wall), (1, 1))
-    field.condition(data, np.arange(len(data)))
+    field = conditioned(prior.changed(Images.of(prior.frame, wall, 0.1)), data, np.arange(len(data)))
     batch = data.batch(np.arange(9))
     again = read_back(field)
     torch.testing.assert_close(again.predict(batch).mean, field.predict(batch).mean)

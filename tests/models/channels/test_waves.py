@@ -1,11 +1,11 @@
 """The closed-form field of complex channels."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
-from closed import fitted_to, read_back
+from closed import conditioned, fitted_to, read_back
 from releases import REAL
 from rooms import WAVELENGTH, nmse, shoebox
 from scenes import answer_error, fold_of
@@ -14,12 +14,14 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
-from gsparc.models.channels.columns import bands, gather
+from gsparc.models.channels.columns import At, bands, gather
 from gsparc.models.channels.complex_gp import ComplexGP
-from gsparc.models.channels.covariance import Shape, Values, diffuse_of, disturbance, prior, specular
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import cells, directed, directions, sphere
+from gsparc.models.channels.prior import ChannelPrior
+from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.ops import Pose
 from gsparc.processes.left_out import groups_of
 from gsparc.training.context import FitContext
@@ -43,27 +45,33 @@ def _sent(count=90, *, seed=0, direct=1.0, leakage=0.5, diffuse=0.0, noise=0.05,
     return from_arrays({**arrays, "frequency_hz": np.array([2.4e9])})
 
 
-def _diffuse(values, wavenumber, a, b):
-    """The diffuse field's covariance as of any end."""
-    return diffuse_of(values, wavenumber, values.of("direction")[None], a, b)[0]
-
-
-def _values(shape, planes=None, seed=0):
-    power = torch.rand(len(shape.names), dtype=torch.float64, generator=torch.manual_seed(seed)) + 0.2
-    envelope, gain = torch.tensor([0.4, 0.3], dtype=torch.float64)
-    planes = torch.zeros(0, 4, dtype=torch.float64) if planes is None else planes
-    offset = torch.tensor([0.01, -0.02, 0.0]).double()
-    return Values(**shape.state(), power=power, envelope=envelope, gain=gain, offset=offset, planes=planes)
-
-
-def _whole(data, *, correlated=False, mirrors=1, angles=4):
-    """A field with every term, on the first 40 rows."""
-    middle = torch.from_numpy(data.moving).mean(0)
-    shape = Shape(sphere(angles), 5.0, True, True, correlated, middle, 20.0, ((0,),)[:mirrors])
+def _prior(data, *, correlated=False, mirrors=1, angles=4, envelope=0.4):
+    """Every term."""
+    frame = Frame(
+        torch.from_numpy(data.moving).mean(0), 20.0, envelope, 0.3, torch.tensor([0.01, -0.02, 0.0]).double()
+    )
     planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]  # beneath everything
-    field = ChannelField.of(data.site, _values(shape, planes), tuple(data.target.shape[1:]))
-    field.condition(data, np.arange(40))
-    return field
+    sizes = [1, angles, 1, 2, 2 * mirrors, 1, 2 * correlated]
+    power = torch.rand(sum(sizes), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
+    isotropic, unequal, leakage, direct, images, noise, drift = power.split(sizes)
+    return ChannelPrior(()).changed(
+        Isotropic(frame, isotropic),
+        Directions(frame, unequal, angles=sphere(angles), concentration=5.0),
+        Leakage(frame, leakage),
+        Direct(frame, direct),
+        Images(frame, images, planes=planes),
+        Noise(frame, noise),
+        Drift(frame, drift),
+    )
+
+
+def _whole(data, **terms):
+    """A field with every term, on the first 40 rows."""
+    return conditioned(_prior(data, **terms), data, np.arange(40))
+
+
+def _signal(prior, a, b):
+    return next(prior.together([a], [b]))
 
 
 def test_isotropic_term_alone_is_the_plain_process():
@@ -73,7 +81,9 @@ def test_isotropic_term_alone_is_the_plain_process():
     field, notes = fitted_to(ChannelField(PLAIN), data, np.concatenate([fold.train, fold.val]))
     assert field.terms == ("residual",) and field.count == 0
     if "kept" in notes[1]:  # powers beside the grid's
-        field.values = replace(field.values, power=torch.tensor([1.0, plain.kernel.noise]).double())
+        powers = torch.tensor([[1.0], [plain.kernel.noise]]).double()
+        terms = zip(field.prior.terms, powers, strict=True)
+        field.prior = ChannelPrior(tuple(replace(term, power=power) for term, power in terms))
         field.condition(data, np.concatenate([fold.train, fold.val]))
     batch = data.batch(fold.test)
     before, after = plain.predict(batch), field.predict(batch)
@@ -112,21 +122,18 @@ def test_covariance_is_hermitian_and_its_diagonal_the_prior():
     data = _sent(60)
     field = _whole(data, correlated=True)
     group = gather(data, np.arange(40), True)[0]
-    values = field.values
-    here = group.places
-    signal = _diffuse(values, K, here, here) + specular(values, group.slot, here, here)
+    (signal,) = field.prior.of_groups([group])
     torch.testing.assert_close(signal, signal.mH)
-    torch.testing.assert_close(signal.diagonal().real, prior(values, group.slot, here))
-    assert torch.linalg.eigvalsh(signal + disturbance(values, group)).min() > 0
+    torch.testing.assert_close(signal.diagonal().real, field.prior.variance(group))
+    assert torch.linalg.eigvalsh(signal + field.prior.disturbance(group)).min() > 0
 
 
 def test_slopes_of_the_evidence_and_what_compression_costs():
     data = _sent(120, diffuse=1.0, side=0.3)
-    field = _whole(data)
-    values = replace(_values(field.values, field.values.planes), envelope=torch.tensor(2.0).double())
+    prior = _prior(data, envelope=2.0)
     groups = tuple(map(evidence.normalised, gather(data, np.arange(120), True)))
-    part = evidence.compressed(groups, values)[0]
-    power = values.power
+    part = evidence.compressed(groups, prior)[0]
+    power = part.own(prior)
     assert part.basis.shape[1] < 80
     at = evidence.solved(part, power)
     slope = evidence.slope(part, power, at)
@@ -137,9 +144,7 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
         ]
         assert float(slope[number]) == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4)
     group = groups[0]
-    whole = _diffuse(values, K, group.places, group.places)
-    whole = whole + specular(values, group.slot, group.places, group.places)
-    whole = whole + disturbance(values, group)
+    whole = prior.of_groups(groups)[0] + prior.disturbance(group)
     fit = (group.target.conj() * torch.linalg.solve(whole, group.target)).real.mean()
     expected = float(len(group) * fit.log() + torch.logdet(whole).real)
     assert at.nll == pytest.approx(expected, abs=1.0)
@@ -148,6 +153,32 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
     mine = torch.from_numpy(np.flatnonzero(cell == 2))
     own = torch.linalg.solve(inverse[mine[:, None], mine], (inverse @ group.target)[mine])
     assert (error[mine] - own).abs().max() < 0.03 * own.abs().max()
+
+
+@dataclass(frozen=True)
+class _Tilt(ChannelTerm):
+    """A gain that grows along x, the least that a term has to say."""
+
+    def covariance(self, a, b):
+        return self.power * a.places[:, :1] * b.places[:, 0]
+
+    def variance(self, a):
+        return self.power * a.places[:, 0].square()
+
+
+def test_a_term_that_says_its_covariance_alone_is_learned_and_answers():
+    data = _sent(60, direct=0.0, leakage=0.0)
+    data = replace(data, target=data.target + 30 * data.moving[:, :1, None].astype(np.complex64))
+    zero, one = torch.zeros(3).double(), torch.ones(1).double()
+    frame = Frame(zero, 20.0, 0.2, 0.3, zero)
+    groups = tuple(map(evidence.normalised, gather(data, np.arange(40), False)))
+    errors = []
+    for more in ((), (_Tilt(frame, 0.2 * one),)):
+        prior = ChannelPrior((Isotropic(frame, one), *more, Noise(frame, 0.01 * one)))
+        prior, _ = evidence.fit_powers(evidence.compressed(groups, prior), prior, 0.0)
+        errors.append(answer_error(conditioned(prior, data, np.arange(40)), data, np.arange(40, 60)))
+    assert errors[1] < 0.5 * errors[0]
+    assert prior[_Tilt].power > 10 * prior[Isotropic].power
 
 
 @pytest.mark.parametrize("correlated", [False, True])
@@ -175,9 +206,9 @@ def test_far_away_nothing_is_known():
     far = Pose(torch.tensor([3e4, 0.0, 0.0]), torch.eye(3))
     found = field.predict(Query(torch.from_numpy(data.tx[:1]).float(), far))
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
-    values, known = field.values, field.weights[0]
+    known = field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
-    expected = prior(values, known.group.slot, place) + values.of("noise")
+    expected = field.prior.variance(At(known.group.slot, place)) + field.prior.noise
     assert found.variance.item() == pytest.approx(known.scale * expected.item(), rel=1e-3)
 
 
@@ -185,17 +216,13 @@ def test_far_away_nothing_is_known():
 @pytest.mark.parametrize("plain", [False, True])
 def test_variances_have_the_digits_they_need(noise, plain):
     data, dtype = _sent(60), torch.float64 if noise < 1e-3 else torch.float32
-    field = _whole(data, mirrors=0, angles=0 if plain else 4)
+    prior = _prior(data, mirrors=0, angles=0 if plain else 4)
+    prior = prior.changed(replace(prior[Noise], power=torch.full((1,), noise).double()))
     if plain:
-        middle = field.values.middle
-        shape = Shape(torch.zeros(0, 3).double(), 5.0, True, False, False, middle, 20.0)
-        field = ChannelField.of(data.site, _values(shape), tuple(data.target.shape[1:]))
-    field.values.of("noise")[:] = noise
-    field.condition(data, np.arange(40))
-    (known,) = field.weights
-    there, here = known.group.places, torch.from_numpy(data.moving[30:50]).double()
-    values, slot = field.values, known.group.slot
-    cross = _diffuse(values, slot.wavenumber, here, there) + specular(values, slot, here, there)
+        prior = prior.changed(replace(prior[Direct], power=torch.zeros(0).double()))
+    (known,) = conditioned(prior, data, np.arange(40)).weights
+    here = At(known.group.slot, torch.from_numpy(data.moving[30:50]).double())
+    cross = _signal(prior, here, known.group)
     white = torch.linalg.solve_triangular(known.given.factor.lower, cross.mH, upper=False)
     exact = white.abs().square().sum(0)
     assert known.root.dtype == (dtype if plain else dtype.to_complex())
@@ -204,11 +231,10 @@ def test_variances_have_the_digits_they_need(noise, plain):
 
 def test_directions_in_blocks_are_those_at_once(monkeypatch):
     data = _sent(60)
-    field = _whole(data)
-    places = field.weights[0].group.places
-    whole = _diffuse(field.values, K, places, places)
-    monkeypatch.setattr("gsparc.models.channels.covariance.BLOCK", 1)
-    torch.testing.assert_close(_diffuse(field.values, K, places, places), whole)
+    (group,), term = gather(data, np.arange(40), True), _prior(data)[Directions]
+    whole = term.covariance(group, group)
+    monkeypatch.setattr("gsparc.models.channels.terms.directions.BLOCK", 1)
+    torch.testing.assert_close(term.covariance(group, group), whole)
 
 
 def test_slopes_over_places():
@@ -247,7 +273,7 @@ def test_a_static_end_that_stands_elsewhere_is_found():
         ChannelField(ChannelSettings(directions=False, correlated=False)), data, np.arange(150)
     )
     assert "direct" in field.terms
-    np.testing.assert_allclose(field.values.offset[:2], (moved - END)[:2], atol=0.02)
+    np.testing.assert_allclose(field.prior.frame.offset[:2], (moved - END)[:2], atol=0.02)
 
 
 def test_runs_are_brought_together():
@@ -299,7 +325,7 @@ def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
         torch.testing.assert_close(getattr(after, name), getattr(before, name))
     assert again.terms == field.terms
     with pytest.raises(ValueError, match="not conditioned"):
-        ChannelField.of(data.site, field.values, (1, 1)).predict(batch)
+        ChannelField().predict(batch)
     with pytest.raises(ValueError, match="known carrier"):
         fitted_to(ChannelField(PLAIN), replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30))
 

@@ -1,11 +1,9 @@
 """Channels of several static ends in one field."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
-from closed import fitted_to, read_back
+from closed import conditioned, fitted_to, read_back
 from releases import REAL
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
@@ -13,18 +11,14 @@ from scenes import answer_error, fold_of
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
+from gsparc.models.channels.columns import At, Slot
 from gsparc.models.channels.complex_gp import ComplexGP
-from gsparc.models.channels.covariance import (
-    Shape,
-    Values,
-    angle_knot_weights,
-    diffuse_of,
-    directional,
-    prior,
-)
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import sphere
+from gsparc.models.channels.prior import ChannelPrior
+from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms.term import Frame
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.per_station import for_links
@@ -58,26 +52,29 @@ def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), run
 
 
 def _tied(data, rows):
-    middle = torch.from_numpy(data.moving).mean(0)
-    angles = sphere(16)[:8]
-    shape = Shape(angles, 5.0, True, True, False, middle, 20.0)
-    power = torch.rand(len(shape.names), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
-    envelope, gain = torch.tensor([0.6, 0.4], dtype=torch.float64)
-    learned = {"power": power, "envelope": envelope, "gain": gain}
-    learned["towards"] = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
-    learned["offset"] = torch.tensor([0.01, -0.02, 0.0]).double()
-    field = ChannelField.of(data.site, Values(**shape.state(), **learned), (1, 1))
-    field.condition(data, rows)
-    return field
+    offset = torch.tensor([0.01, -0.02, 0.0]).double()
+    frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 0.6, 0.4, offset)
+    power = torch.rand(13, dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
+    towards = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
+    prior = ChannelPrior(()).changed(
+        Isotropic(frame, power[:1]),
+        Directions(frame, power[1:9], angles=sphere(16)[:8], concentration=5.0, towards=towards),
+        Leakage(frame, power[9:10]),
+        Direct(frame, power[10:12]),
+        Noise(frame, power[12:]),
+    )
+    return conditioned(prior, data, rows)
 
 
 def test_knots_add_up_and_mirrored_directions_count_alike():
-    middle = torch.zeros(3, dtype=torch.float64)
-    half = sphere(800)
+    half, zero = sphere(800), torch.zeros(3, dtype=torch.float64)
     half = half[half[:, 2] > 0]
-    shape = Shape(half, 8.0, False, False, False, middle, 10.0)
+    term = Directions(
+        Frame(zero, 10.0, 1.0, 1.0, zero), torch.ones(len(half)).double(), angles=half, concentration=8.0,
+        towards=torch.zeros(5).double(),
+    )  # fmt: skip
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
-    found = angle_knot_weights(shape, ends, 5)
+    found = term.ways([Slot(0, (0,), (0,), end, zero, K) for end in ends])
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())
     torch.testing.assert_close(found[0], found[1], atol=0.05, rtol=0)
 
@@ -85,15 +82,14 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
 def test_each_end_has_the_covariance_of_its_own_powers():
     data = _ceiling()
     field = _tied(data, np.arange(len(data)))
-    values, slots = field.values, [one.group.slot for one in field.weights]
+    term, slots = field.prior[Directions], [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
-    powers = directional(values, slots)
-    together = diffuse_of(values, K, powers, places, places)
+    ends = [At(slot, places) for slot in slots]
+    powers, together = term.of(slots), list(term.together(ends, ends))
     for number in (0, 3):
-        alone = diffuse_of(values, K, powers[number : number + 1], places, places)[0]
+        alone = term.covariance(ends[number], ends[number])
         torch.testing.assert_close(together[number], alone)
-        level = prior(replace(values, direct=False, constant=False), slots[number], places)
-        torch.testing.assert_close(alone.diagonal().real, level)
+        torch.testing.assert_close(alone.diagonal().real, term.variance(ends[number]))
     assert not torch.allclose(powers[0], powers[1])
 
 

@@ -15,9 +15,9 @@ from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import turned
 from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.scene import steering
-from gsparc.models.image_sources.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
 
@@ -40,7 +40,7 @@ def test_few_receivers_are_enough_with_directions():
     rows = np.arange(60)
     fold = Fold(rows[:12], rows[12:14], rows[14:])
     method, note = fitted(data, fold)
-    found = method.sources + method.frame.middle
+    found = method.posterior.positions.points + method.frame.middle
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
     assert error(method, data, fold.test) < 0.02
@@ -49,7 +49,7 @@ def test_few_receivers_are_enough_with_directions():
 
 def test_occlusion_by_a_pillar_is_learned(pillar):
     data, fold, sources, method = pillar
-    assert bool((method.visibility.seen == 0).any())
+    assert bool((method.posterior.visibility.seen == 0).any())
     rays = sources[None] - data.rx_position[:, None]  # to all sources, whoever hides
     rays = list((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
     blind, _ = fitted(replace(data, directions=rays), fold)
@@ -70,15 +70,16 @@ def test_rows_left_out_are_predicted_as_by_a_fit_without_the_receiver():
     method, _ = fitted(data, fold, rows=96)
     left = method.left_out()
     assert len(left.rows) == 96  # three tones each
-    rows, waves, k = method.rows, method.waves, 7
-    kept = torch.nonzero(method.observer != k).flatten()
-    out = torch.nonzero(method.observer == k).flatten()
-    shared = (waves[kept] * method.power) @ waves[kept].mH
-    shared *= method.kernel.correlation(rows.position[kept], rows.position[kept])
-    shared.diagonal().add_(method.kernel.noise + 1e-5)
-    probability = steering(rows.take(out), method.sources) * method.visibility.left_out[k].float()
-    cross = (probability * method.power) @ waves[kept].mH
-    cross *= method.kernel.correlation(rows.position[out], rows.position[kept])
+    given, k = method.posterior, 7
+    rows, waves = given.rows, given.waves
+    kept = torch.nonzero(given.observer != k).flatten()
+    out = torch.nonzero(given.observer == k).flatten()
+    shared = (waves[kept] * given.power) @ waves[kept].mH
+    shared *= given.kernel.correlation(rows.position[kept], rows.position[kept])
+    shared.diagonal().add_(given.kernel.noise + 1e-5)
+    probability = steering(rows.take(out), given.positions.points) * given.visibility.left_out[k].float()
+    cross = (probability * given.power) @ waves[kept].mH
+    cross *= given.kernel.correlation(rows.position[out], rows.position[kept])
     predicted = cross @ torch.linalg.solve(shared, rows.target[kept])
     loud = (method.frame.carrier_hz / rows.frequency[out]).float()[:, None] * method.frame.scale
     torch.testing.assert_close(left.mean[out].squeeze(-1), predicted * loud, atol=1e-4, rtol=1e-2)
@@ -131,7 +132,7 @@ def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
     assert error(method, data, fold.test) < (0.07 if degrees < 2 else 0.25)
     estimated = float(note.partition("error ")[2].partition(" degrees")[0])
     assert abs(estimated / degrees - 1) < 0.3
-    found = method.sources + method.frame.middle
+    found = method.posterior.positions.points + method.frame.middle
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == 7 and float(apart.median()) < 0.06  # half a wavelength
 

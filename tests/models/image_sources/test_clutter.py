@@ -11,18 +11,17 @@ from gains import gains, phased
 from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
-from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles, tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box
-from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch, walls
+from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
-from gsparc.models.image_sources.clutter.residual import Residual
+from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import all_sequences
 from gsparc.processes.worker import Cancelled, cancelled_by, late_when
 
@@ -88,7 +87,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
 
 def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     places = _rows(20).position
-    paths = Unfolding.of(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
+    paths = Unfolding(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
     torch.testing.assert_close(paths.start[:, :, 0], places.float().expand(2, -1, -1))
     torch.testing.assert_close(paths.end[:, :, -1], TRANSMITTER.float().expand(2, 20, 3))
     torch.testing.assert_close(paths.end[:, :, :-1], paths.start[:, :, 1:])
@@ -98,7 +97,7 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     length = (paths.end - paths.start).norm(dim=-1).sum(-1)
     torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
     behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
-    assert not Unfolding.of(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
+    assert not Unfolding(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
 
 
 def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
@@ -117,11 +116,8 @@ def test_concatenated_scenes_do_not_interact():
     places = _rows(15).position
     one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
     two = _scene(_boxed(_box()))
-    unfolding = Unfolding.concatenate([one.unfolding, two.unfolding.with_offset(len(planes))])
-    obstacles = Obstacles.concatenate(
-        [Obstacles.of(s.clutter, s.planes, len(s.sequences)) for s in (one, two)]
-    )
-    together = obstacles.visible_share(unfolding.paths(places))
+    members = [Posterior(_rows(3), phased(each, torch.zeros(len(each.sequences)))) for each in (one, two)]
+    together = Means(members).visible_share(places)
     torch.testing.assert_close(
         together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
     )
@@ -159,7 +155,8 @@ def test_residual_is_the_same_likelihood():
 
 def test_score_is_what_the_best_multiple_gains():
     rows = replace(_rows(20), target=torch.randn(20, 1, dtype=torch.complex64))
-    scene, scorer = _unexplained(rows, _bare())
+    left = _unexplained(rows, _bare())
+    scene, scorer = left.scene, left.scorer
     change = torch.randn(20, 8, dtype=torch.complex64)
     score, multiple = scorer.score_positive(change)
     best = int(score.argmax())
@@ -178,12 +175,7 @@ def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
 
 def test_the_pillar_is_found_by_its_shadow():
     rows = _truth(_scene(_boxed(_box())), _rows(150))
-    start = _bare()
-    scene, scorer = _unexplained(rows, start)
-    box, score = find_box(
-        scorer, scene.unfolding.paths(rows.position), start.unobstructed(rows), _room(),
-        torch.Generator().manual_seed(0), draws=500,
-    )  # fmt: skip
+    box, score = find_box(_unexplained(rows, _bare()), draws=500)
     assert score > 20
     middle = (box[:2] + box[3:5]) / 2
     torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
@@ -194,26 +186,27 @@ def _bare(sources: int = 7) -> Scene:
     return phased(_scene(Clutter.none()), torch.zeros(sources))
 
 
-def _unexplained(rows: Rows, start: Scene) -> tuple:
-    """The scene with its noise, and the scorer of what it leaves."""
+def _unexplained(rows: Rows, start: Scene) -> Unexplained:
+    """What is left of rows by a scene without clutter, with its noise."""
     residual = Residual(rows, start)
-    seen = torch.ones(len(start.sequences), len(rows))
-    return residual.scene, residual.scorer(seen, residual.scene.log_amplitude)
+    scene, paths = residual.scene, start.unfolding.paths(rows.position)
+    scorer = residual.scorer(torch.ones(len(start.sequences), len(rows)), scene.log_amplitude)
+    waves, generator = start.unobstructed(rows), torch.Generator().manual_seed(0)
+    return Unexplained(rows, scene, scorer, paths, waves, _room(), generator)
 
 
-def _beside_a_table(count: int) -> tuple:
-    """Rows of a room with a table, what its walls alone leave unexplained, the table, and the walls."""
+def _beside_a_table(count: int) -> tuple[Unexplained, Clutter]:
+    """What walls leave unexplained of rows in a room with a table, and the table."""
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
-    scene, scorer = _unexplained(rows, _bare())
-    return rows, scorer, clutter, walls(scene.planes, scene.sequences)
+    return _unexplained(rows, _bare()), clutter
 
 
 def test_a_table_top_is_found_by_its_reflections():
-    rows, scorer, clutter, numbers = _beside_a_table(200)
-    best = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
+    left, clutter = _beside_a_table(200)
+    best = find_mirrors(left, 3)[0]
     assert best.plane[2].abs() == 1 and best.score > 15
     assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
     found, true = (patch.view(2, 2).mean(0) for patch in (best.patch, clutter.patches[0]))
@@ -222,19 +215,19 @@ def test_a_table_top_is_found_by_its_reflections():
 
 def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
     """A raster of 35 cm cells over 40 km asked for six terabytes."""
-    rows, scorer, _, numbers = _beside_a_table(60)
-    whole = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
+    left, _ = _beside_a_table(60)
+    whole = find_mirrors(left, 3)
     monkeypatch.setattr(finite_mirrors, "BLOCK_CELLS", 2e4)  # the raster in parts is the same
-    parts = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
+    parts = find_mirrors(left, 3)
     assert len(whole) > 0 and [m.score for m in parts] == [m.score for m in whole]
     with caplog.at_level("INFO"):
-        assert find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
+        assert find_mirrors(replace(left, room=1e4 * _room()), 3) == []
     assert "no search for small mirrors" in caplog.text
 
 
 def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
     """It looked at neither clock nor interrupt: `budget_s=60` was at 150 s and going."""
-    rows, scorer, _, numbers = _beside_a_table(60)
+    left, _ = _beside_a_table(60)
     spent: list[float] = []
 
     def unwanted() -> bool:
@@ -242,27 +235,27 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         return spent[-1] > spent[0] + 0.5
 
     with cancelled_by(unwanted), pytest.raises(Cancelled):
-        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 4 * _room(), 3)
+        find_mirrors(replace(left, room=4 * _room()), 3)
     assert max(np.diff([*spent, time.thread_time()])) < 0.5
     room, cells = 20 * _room(), []
 
     def nothing(*args) -> tuple:
-        cells.append((len(args[4]), args[7]))
-        return torch.zeros(len(args[4])), torch.zeros(len(args[4]), 4)
+        cells.append((len(args[1]), args[3]))
+        return torch.zeros(len(args[1])), torch.zeros(len(args[1]), 4)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finite_mirrors, "_raster", nothing)
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
-        find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers[:1], room, 3)
+        find_mirrors(replace(left, room=room, scene=left.scene.only([0, 1])), 3)
     count = sum(planes for planes, _ in cells) * math.prod(
-        finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[numbers[0]]), cells[0][1])
+        finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[0]), cells[0][1])
     )
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
 
 
 def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     """A round of everything went on after the clock; now each step is left in the middle."""
-    rows, *_ = _beside_a_table(60)
+    rows = _beside_a_table(60)[0].rows
     start, looks = _bare(), []
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
     with late_when(late):
@@ -278,14 +271,11 @@ def test_an_infinite_mirror_becomes_finite():
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
     rows = _truth(true, _rows(250))
     start = phased(replace(true, clutter=Clutter.none()), torch.zeros(10))
-    paths, generator = true.unfolding.paths(rows.position), torch.Generator().manual_seed(0)
-    _, scorer = _unexplained(rows, start)
-    patch, score = find_patch(
-        scorer, paths, sequences, 6, TABLE, start.unobstructed(rows), _room(), generator
-    )  # fmt: skip
+    left = _unexplained(rows, start)
+    patch, score = find_patch(left, 6)
     assert score > 10
     learned, told = (
-        visible_share(paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
+        visible_share(left.paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
         for each in (patch, clutter.patches[0])
     )
     assert (learned == told).float().mean() > 0.85

@@ -10,8 +10,7 @@ from gsparc.models.image_sources import refine
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene, correlations, steering
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, correlations, steering
 from gsparc.processes.kernel import matern32_of_squares
 
 COUNT = 24

@@ -18,7 +18,7 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import box_of, gather, scatterers
+from gsparc.models.image_sources.rows import gather
 from gsparc.models.mixture.named import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -254,7 +254,7 @@ def test_scatterers_are_found_and_told_from_images(tmp_path):
     method, _ = fitted(data, fold, tmp_path, clutter=False, search_rows=220, margin=4.0)
     scene = method.members[0].scene
     places = (scene.sources + method.frame.middle).numpy() + data.site.origin
-    scattered = scatterers(scene.sources, box_of(method.members[0].rows, scene.transmitter)).numpy()
+    scattered = scene.scatterers(method.members[0].rows).numpy()
     images = told.images.of(told.tx[0])[told.images.order == 1]
     for wanted, found, within in ((true, places[scattered], 0.1), (images, places[~scattered], 0.3)):
         nearest = np.linalg.norm(wanted[:, None] - found[None], axis=-1).min(1)

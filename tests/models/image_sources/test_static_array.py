@@ -18,9 +18,8 @@ from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import gather, static_array
-from gsparc.models.image_sources.scene import Scene, steering
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, steering
 from gsparc.models.image_sources.search_cache import SearchCache
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext
@@ -152,7 +151,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     waves = steering(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(quick_score(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert score(rows, spread, Posterior(rows, scene).conditioned)[0].shape == (300,)
+    assert score(Posterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         steering(rows, points)
 

@@ -53,7 +53,7 @@ def test_sources_are_found_within_the_settings(data, found):
     assert "1 searches" in report.notes[0]
     assert site_problem(data) is None
     bare = dataclasses.replace(data, site=dataclasses.replace(data.site, array=None))
-    assert "which array" in str(site_problem(bare))
+    assert "no array" in str(site_problem(bare))
 
 
 def test_the_mean_is_what_sources_explain_and_the_residual(data, field):

@@ -132,7 +132,7 @@ def test_unusable_data_are_refused(data, fold, tmp_path):
             MovingArrayField().fit(dataclasses.replace(data, site=site), fold, FitContext(tmp_path))
 
     refused("moving receiver", static_end="rx")
-    refused("which array", array=None)
+    refused("no array", array=None)
     turned = data.rx_rotation.copy()
     turned[3] = np.diag([-1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="one orientation"):

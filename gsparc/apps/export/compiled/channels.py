@@ -9,8 +9,7 @@ from gsparc.apps.export.compiled.blob import Form
 from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.query import Means
-from gsparc.models.image_sources.rows import query_elements, static_array
-from gsparc.ops import Pose
+from gsparc.models.image_sources.rows import elements, static_array
 from gsparc.physics.waves import evenly_spaced
 
 LANES = 16
@@ -19,17 +18,17 @@ BEYOND = 1e6  # [m], a place that is near none
 
 def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     """Of an ensemble's sources without clutter, whose gains `query` has."""
-    pack, rotation = query.pack, np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    count, rows = len(pack.sources), len(pack.places)
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    count, rows = len(query.sources), len(query.places)
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES
     weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
     array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
     if site.moving_end == "rx":
-        still = Pose(torch.zeros(3), torch.from_numpy(np.asarray(rotation, np.float32)))
-        moving = query_elements(site, still, 1, method.frame.antennas)[0].numpy()
-    images = pack.sources[None]
+        turned = torch.from_numpy(np.asarray(rotation, np.float32)).double()[None]
+        moving = elements(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
+    images = query.sources[None]
     if array is not None:
-        images = images + torch.einsum("kij,ej->eki", pack.orientations, torch.from_numpy(array))
+        images = images + torch.einsum("kij,ej->eki", query.orientations, torch.from_numpy(array))
 
     def padded(value: torch.Tensor, beyond: float = 0.0) -> np.ndarray:
         return torch.nn.functional.pad(value.float(), (0, wide - rows), value=beyond).numpy()
@@ -41,11 +40,11 @@ def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     factors = (method.frame.scale * site.target_scale / method.factors).numpy().astype(np.complex64)
     arrays = {
         "middle": method.frame.middle.double().numpy(), "moving": moving.astype(np.float64),
-        "sources": pack.sources.double().numpy(), "images": images.double().numpy(),
+        "sources": query.sources.double().numpy(), "images": images.double().numpy(),
         "offsets": np.zeros(0) if array is None else array.astype(np.float64),
-        "combs": np.array(combs, np.float64), "by_angle": pack.by_angle.flatten().float().numpy(),
-        "by_length": pack.by_length.flatten().float().numpy(), "places": padded(pack.places.T, BEYOND),
-        "towards": padded(pack.towards), "level": (query.level * weight)[:, 0].numpy(),
+        "combs": np.array(combs, np.float64), "by_angle": query.by_angle.flatten().float().numpy(),
+        "by_length": query.by_length.flatten().float().numpy(), "places": padded(query.places.T, BEYOND),
+        "towards": padded(query.towards), "level": (query.level * weight)[:, 0].numpy(),
         "weights": padded((query.weights * weight).mT), "factors": factors.view(np.float32),
     }  # fmt: skip
     still_ends = 1 if array is None else len(array)

@@ -180,7 +180,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     """The heaviest search's sources without clutter, their gains given a model's answers."""
     member = method.members[int(torch.as_tensor(method.weights).argmax())]
     data = replace(data, target=data.target * method.factors.numpy()[:, None])
-    rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.seed))
+    rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.settings.seed))
     scene = replace(member.scene, clutter=Clutter.none())
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))

@@ -8,6 +8,7 @@ can be moved by gradients.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -65,12 +66,14 @@ class Clutter:
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
     """Visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
-    return Obstacles.of(clutter, planes, paths.valid.shape[0]).visible_share(paths, soft)
+    return Obstacles([clutter], [planes], [len(paths.valid)]).visible_share(paths, soft)
 
 
-@dataclass(frozen=True)
 class Obstacles:
     """Clutter of one or more scenes, prepared for paths of all their K sources.
+
+    Args:
+        clutters, planes, sources: of each scene its clutter, planes (P, 4) and number of sources.
 
     Attributes:
         boxes: (B, 6).
@@ -83,47 +86,20 @@ class Obstacles:
         ends: (P + 1,) bool, which planes have patches; the last is no plane.
     """
 
-    boxes: Tensor
-    box_mask: Tensor
-    patches: Tensor
-    patch_mask: Tensor
-    plane: Tensor
-    axes: Tensor
-    offset: Tensor
-    ends: Tensor
-
-    @staticmethod
-    def of(clutter: Clutter, planes: Tensor, sources: int) -> Obstacles:
-        """From one scene's clutter, planes (P, 4) and number of sources."""
-        plane = torch.tensor(clutter.plane, dtype=torch.long)
-        ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
-        ends[plane] = True
-        used = planes[plane]
+    def __init__(self, clutters: list[Clutter], planes: list[Tensor], sources: list[int]) -> None:
+        first, table = [0, *accumulate(map(len, planes))], torch.cat(planes)
+        numbers = [i + start for each, start in zip(clutters, first, strict=False) for i in each.plane]
+        plane = torch.tensor(numbers, dtype=torch.long)
+        self.ends = torch.zeros(len(table) + 1, dtype=torch.bool)
+        self.ends[plane] = True
+        used, owner = table[plane], _scene_of(sources)
         axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
-        return Obstacles(
-            clutter.boxes,
-            torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
-            clutter.patches,
-            torch.ones(len(plane), sources, 1, dtype=torch.bool),
-            plane.view(-1, 1, 1, 1),
-            torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3),
-            used[:, 3].float().view(-1, 1, 1, 1),
-            ends,
-        )
-
-    @staticmethod
-    def concatenate(many: list[Obstacles]) -> Obstacles:
-        """Of several scenes, with consecutive indices of sources and planes."""
-        planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
-        names = ("boxes", "patches", "offset")
-        return Obstacles(
-            **{name: torch.cat([getattr(s, name) for s in many]) for name in names},
-            box_mask=_blocks([s.box_mask for s in many]),
-            patch_mask=_blocks([s.patch_mask for s in many]),
-            plane=torch.cat([s.plane + first for s, first in zip(many, planes, strict=False)]),
-            axes=torch.cat([s.axes for s in many], 1),
-            ends=torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
-        )
+        self.boxes = torch.cat([each.boxes for each in clutters])
+        self.box_mask = (_scene_of([len(each.boxes) for each in clutters])[:, None] == owner)[..., None]
+        self.patches = torch.cat([each.patches for each in clutters])
+        self.patch_mask = (_scene_of([len(each.plane) for each in clutters])[:, None] == owner)[..., None]
+        self.plane, self.offset = plane.view(-1, 1, 1, 1), used[:, 3].float().view(-1, 1, 1, 1)
+        self.axes = torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3)
 
     def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
         """Visible share (K, n) in [0, 1] of each source."""
@@ -184,9 +160,9 @@ def _inside(place: list[Tensor], patches: Tensor, soft: float) -> Tensor:
     return torch.sigmoid(inner / soft)
 
 
-def _blocks(owned: list[Tensor]) -> Tensor:
-    """(B_i, K_i, 1) side by side on a diagonal."""
-    return torch.block_diag(*[o[..., 0].float() for o in owned])[..., None] > 0
+def _scene_of(counts: list[int]) -> Tensor:
+    """The number of the scene that each of so many pieces of every scene belongs to."""
+    return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
 
 
 def tangents(plane: Tensor) -> Tensor:

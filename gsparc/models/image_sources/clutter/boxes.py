@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import past_boxes
-from gsparc.models.image_sources.clutter.residual import CandidateScorer
-from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.clutter.residual import Unexplained
 
 THINNEST = 0.03  # [m]
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
@@ -47,42 +46,30 @@ def evolve(
 
 
 def find_box(
-    scorer: CandidateScorer,
-    paths: Paths,
-    visible_waves: Tensor,
-    room: Tensor,
-    generator: torch.Generator,
-    *,
-    draws: int = 1000,
-    parents: int = 12,
-    seeds: Tensor | None = None,
+    left: Unexplained, draws: int = 1000, parents: int = 12, seeds: Tensor | None = None
 ) -> tuple[Tensor, float]:
     """The box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
-        scorer: what is left.
-        paths: of all K sources.
-        visible_waves: (n, K) complex, waves of the sources under the present clutter.
-        room: (2, 3) [m], where boxes may be.
-        generator: of the candidates.
+        left: what a shadow may explain.
         draws, parents: random boxes, and how many of them evolve.
         seeds: (s, 6) more parents.
     """
-    waves = visible_waves * scorer.gains
+    waves = left.waves * left.scorer.gains
     chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
-    few, waves = paths.take(chosen), waves[:, chosen]
+    few, waves = left.paths.take(chosen), waves[:, chosen]
 
     def score(boxes: Tensor) -> Tensor:
-        return scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
+        return left.scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
 
     def repaired(boxes: Tensor) -> Tensor:
-        return inside_out(boxes, room)
+        return inside_out(boxes, left.room)
 
-    starts = repaired(_random(draws, room, generator))
+    starts = repaired(_random(draws, left.room, left.generator))
     starts = starts[score(starts).topk(min(parents, draws)).indices]
     if seeds is not None:
         starts = torch.cat([starts, repaired(seeds)])
-    return evolve(starts, score, repaired, generator)
+    return evolve(starts, score, repaired, left.generator)
 
 
 def inside_out(boxes: Tensor, room: Tensor) -> Tensor:

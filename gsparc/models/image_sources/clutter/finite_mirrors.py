@@ -16,11 +16,11 @@ from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import tangents, within
 from gsparc.models.image_sources.clutter.boxes import evolve
-from gsparc.models.image_sources.clutter.residual import CandidateScorer
-from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.clutter.residual import Unexplained
 from gsparc.models.image_sources.rows import Rows
-from gsparc.physics.mirror_planes import Reflections, reflect
-from gsparc.physics.waves import LIGHT, NEAR_M, wave
+from gsparc.models.image_sources.scene import steering
+from gsparc.physics.mirror_planes import reflect
+from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
 
 log = logging.getLogger(__name__)
@@ -39,36 +39,17 @@ BLOCK_CELLS = 1e6  # of the rasters held at a time, four numbers each
 MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
-def find_patch(
-    scorer: CandidateScorer,
-    paths: Paths,
-    sequences: tuple[Reflections, ...],
-    number: int,
-    plane: Tensor,
-    visible_waves: Tensor,
-    room: Tensor,
-    generator: torch.Generator,
-) -> tuple[Tensor, float]:
-    """The patch (4,) on plane `number` that, were its sequences seen only in it, explains most; and its nats.
-
-    Args:
-        scorer: what is left.
-        paths: of all K sources.
-        sequences: of the sources.
-        number, plane: (4,) which.
-        visible_waves: (n, K) complex, waves of the sources as they are seen now.
-        room: (2, 3) [m].
-        generator: of the candidates.
-    """
-    mine = [k for k, sequence in enumerate(sequences) if number in sequence]
-    few, waves = paths.take(mine), visible_waves[:, mine]
-    along = tangents(plane)
+def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
+    """The patch (4,) on a plane that, were its sequences seen only in it, explains most; and its nats."""
+    mine = [k for k, sequence in enumerate(left.scene.sequences) if number in sequence]
+    few, waves = left.paths.take(mine), left.waves[:, mine]
+    along = tangents(left.scene.planes[number])
     met, here = few.end @ along.T, few.plane == number
-    ends = room @ along.T
+    ends = left.room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
     def score(patches: Tensor) -> Tensor:
-        return scorer.score_shares(
+        return left.scorer.score_shares(
             patches, lambda part: torch.where(here, within(met, part), 1.0).prod(-1), waves
         )
 
@@ -76,11 +57,11 @@ def find_patch(
         lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
 
-    middle = low + (high - low) * torch.rand(DRAWS, 2, generator=generator)
-    side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=generator) * math.log(LARGEST / SMALLEST))
+    middle = low + (high - low) * torch.rand(DRAWS, 2, generator=left.generator)
+    side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=left.generator) * math.log(LARGEST / SMALLEST))
     starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[score(starts).topk(8).indices]
-    return evolve(starts, score, repaired, generator, rounds=10)
+    return evolve(starts, score, repaired, left.generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -97,40 +78,26 @@ class SmallMirror:
     patch: Tensor
     score: float
 
+    def same(self, other: SmallMirror, apart: float) -> bool:
+        """Whether both are parallel, closer than `apart` [m] and overlap."""
+        parallel = (self.plane[:3] @ other.plane[:3]).abs() >= PARALLEL
+        if not parallel or (self.plane[3] - other.plane[3]).abs() > apart:
+            return False
+        low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
+        return bool((high > low).all())
 
-def walls(planes: Tensor, sequences: tuple[Reflections, ...]) -> list[int]:
-    """Numbers of planes that make a source of one reflection."""
-    return [i for i in range(len(planes)) if (i,) in sequences]
 
-
-def find_mirrors(
-    rows: Rows,
-    scorer: CandidateScorer,
-    transmitter: Tensor,
-    planes: Tensor,
-    numbers: list[int],
-    room: Tensor,
-    most: int,
-) -> list[SmallMirror]:
-    """Small mirrors parallel to walls, best first.
+def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
+    """At most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
     and before each wall) are collected in a raster of where it is met; integral images give every rectangle.
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
-
-    Args:
-        rows: n.
-        scorer: what is left.
-        transmitter: (3,) float64 [m].
-        planes, numbers: (P, 4), and which of them are walls.
-        room: (2, 3) [m], where mirrors may be.
-        most: of them.
     """
+    rows, room, known = left.rows, left.room, left.scene.planes[left.scene.walls]
     wavelength = LIGHT / float(rows.frequency.mean())
-    alpha, known = scorer.alpha, planes[numbers]
     mirrors: list[SmallMirror] = []
-    scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
     normals: list[Tensor] = []
     for plane in known:
         normal = plane[:3] / plane[:3].norm()
@@ -149,47 +116,28 @@ def find_mirrors(
             continue
         cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
         each = max(math.prod(_cells(room, tangents(candidates[0]), cell)), len(rows)) * many
-        parts = [
-            _raster(rows, alpha, scale, transmitter, block, known, room, cell)
-            for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
-        ]
+        blocks = candidates.split(max(1, int(BLOCK_CELLS / each)))
+        parts = [_raster(left, block, known, cell) for block in blocks]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
     return _apart(mirrors, 0.5 * wavelength)[:most]
 
 
-def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
-    """Whether two mirrors are parallel, closer than `apart` [m] and overlap."""
-    if (one.plane[:3] @ other.plane[:3]).abs() < PARALLEL or (one.plane[3] - other.plane[3]).abs() > apart:
-        return False
-    low, high = torch.maximum(one.patch, other.patch)[:2], torch.minimum(one.patch, other.patch)[2:]
-    return bool((high > low).all())
-
-
 def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
     apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(same_mirror(mirror, other, least) for other in apart):
+        if not any(mirror.same(other, least) for other in apart):
             apart.append(mirror)
     return apart
 
 
-def _raster(
-    rows: Rows,
-    alpha: Tensor,
-    scale: Tensor,
-    transmitter: Tensor,
-    candidates: Tensor,
-    known: Tensor,
-    room: Tensor,
-    cell: float,
-) -> tuple[Tensor, Tensor]:
+def _raster(left: Unexplained, candidates: Tensor, known: Tensor, cell: float) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
     along = tangents(candidates[0])
-    low, cells = (room @ along.T).amin(0), _cells(room, along, cell)
-    tables = []
-    for arriving, met in _sources(rows, transmitter, candidates, known):
+    low, cells = (left.room @ along.T).amin(0), _cells(left.room, along, cell)
+    tables, alpha, scale = [], left.scorer.alpha, left.scorer.scale
+    for arriving, met in _sources(left.rows, left.scene.transmitter, candidates, known):
         raise_if_cancelled()
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
@@ -237,11 +185,8 @@ def _sources(
         meetings.append(_meeting(places, after, candidates))
         first = _meeting(places, before, wall[None].expand(len(candidates), 4))
         meetings.append(_meeting(first, once, candidates))
-    sources = (
-        [once, *more] if rows.array is None else _images(rows.static_ends(transmitter), candidates, known)
-    )
-    away = ((_distance(rows, source), met) for source, met in zip(sources, meetings, strict=True))
-    return [(wave(distance, rows.frequency), met) for distance, met in away]
+    sources = _images(rows.static_ends(transmitter), candidates, known)
+    return [(steering(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
 
 
 def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
@@ -250,14 +195,6 @@ def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
     once = reflect(start, candidates)
     pairs = ((reflect(reflect(start, wall), candidates), reflect(once, wall)) for wall in known)
     return [once, *(image for pair in pairs for image in pair)]
-
-
-def _distance(rows: Rows, sources: Tensor) -> Tensor:
-    """Distances (C, n) [m] from sources (C, 3), or (E, C, 3) of the static end's antennas."""
-    if rows.element is None:
-        return torch.cdist(sources, rows.position).clamp_min(NEAR_M)
-    apart = sources.index_select(0, rows.element) - rows.position[:, None]
-    return torch.linalg.vector_norm(apart, dim=-1).T.clamp_min(NEAR_M)
 
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import PhasedGains, shares, stacked
+from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.gp_likelihood import Posterior, shares, stacked
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
@@ -53,12 +54,9 @@ class Residual:
     def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
-        varying = PhasedGains(self.rows, scene.quadrature)
-        kernel = replace(scene.visibility, constant=0.0)
-        for k, source in enumerate(scene.sources):
-            varying.add(scaled[:, k], kernel.correlation(self.rows.places, source))
+        varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stacked(scaled)[1]
-        return varying.matrix, shares(scene.quadrature)[1] * (across @ across.T)
+        return varying.summed.matrix, shares(scene.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
@@ -142,6 +140,11 @@ class CandidateScorer:
         both = self.root.T @ self.residual
         return torch.complex(both[:n], both[n:])
 
+    @property
+    def scale(self) -> Tensor:
+        """Diagonal of K^-1 (n,), mean of both parts."""
+        return self.root.square().sum(0).view(2, -1).mean(0)
+
     def score(self, change: Tensor) -> Tensor:
         """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
         return self.score_positive(change)[0]
@@ -178,6 +181,29 @@ class CandidateScorer:
             (dot[0][0] * across - dot[0][1] * along) / determinant,
         )
         return (along * gain.real + across * gain.imag) / 2, gain
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What a scene leaves of its rows, and where there may be obstacles that explain it.
+
+    Attributes:
+        rows: n of them.
+        scene: of K sources.
+        scorer: of candidates.
+        paths: of the sources.
+        waves: (n, K) complex, of the sources as they are seen now.
+        room: (2, 3) [m], where obstacles may be.
+        generator: of the candidates.
+    """
+
+    rows: Rows
+    scene: Scene
+    scorer: CandidateScorer
+    paths: Paths
+    waves: Tensor
+    room: Tensor
+    generator: torch.Generator
 
 
 def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -14,27 +15,21 @@ from torch import Tensor
 from gsparc.models.image_sources.backprojection import pick_apart
 from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
 from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
-from gsparc.models.image_sources.clutter.finite_mirrors import (
-    SmallMirror,
-    find_mirrors,
-    find_patch,
-    same_mirror,
-    walls,
-)
+from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
-from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual
+from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Reflections, all_sequences
+from gsparc.models.image_sources.scene import KernelVisibility, Scene
+from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
-BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # parameters of a box, a patch, a patch on a new plane, a new plane
+# Parameters of a box, a patch, a patch on a new plane, a new plane, a sequence.
+BOX, PATCH, MIRROR, WALL, SEQUENCE = 6, 4, 5, 3, 1
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
 MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
@@ -45,6 +40,7 @@ STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
 MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
 BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
+ORDER = 3  # largest of the reflections tried
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
 
@@ -93,16 +89,18 @@ class _ClutterSearcher:
         self.residual.waves = self.waves
         self.nll = self.residual.nll(self.visible, scene.log_amplitude).item()
 
-    def _scorer(self) -> CandidateScorer:
-        return self.residual.scorer(self.visible, self.scene.log_amplitude)
+    def _left(self) -> Unexplained:
+        scorer = self.residual.scorer(self.visible, self.scene.log_amplitude)
+        waves = self.waves * self.visible.T
+        return Unexplained(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
-    def _try(self, scene: Scene, least: float, exact: bool = False) -> bool:
-        """Accept a scene after a few steps of descent, when it gains at least `least` nats.
+    def _try(self, scene: Scene, parameters: int, exact: bool = False) -> bool:
+        """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
 
         Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
         old ones would explain what the new scene occludes.
         """
-        nll = self.nll
+        nll, least = self.nll, parameters * self.parameter_cost
 
         def change() -> None:
             self._set_scene(scene)
@@ -152,11 +150,8 @@ class _ClutterSearcher:
 
     def _improve(self, soft: float) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        steps = (
-            self._mirrors, self._patches, self._boxes, self._sequences, partial(self._settle, soft),
-            self._settle_boxes,
-        )  # fmt: skip
-        for step in steps:
+        found = self._mirrors, self._patches, self._boxes, self._sequences
+        for step in (*found, partial(self._settle, soft), self._settle_boxes):
             step()
             self.whole = self.nll, self.scene
 
@@ -185,38 +180,30 @@ class _ClutterSearcher:
             self._descend(10)
 
     def _mirrors(self) -> None:
-        scene = self.scene
-        mirrors = find_mirrors(
-            self.rows, self._scorer(), scene.transmitter, scene.planes,
-            walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
-        )  # fmt: skip
-        mirrors = [mirror for mirror in mirrors if mirror.score > MIN_GAIN]
-        scorer = self._scorer()
-        placed = [self._placed(mirror, scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
+        left = self._left()
+        mirrors = [mirror for mirror in find_mirrors(left, 2 * MIRRORS) if mirror.score > MIN_GAIN]
+        placed = [self._placed(mirror, left.scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
                 break
-            double = any(same_mirror(mirror, other, self.wavelength) for other in added)
+            double = any(mirror.same(other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
     def _mirrors_on_boxes(self) -> list[SmallMirror]:
         """Faces of boxes that are not on floor or walls, as mirrors."""
         mirrors = []
-        for box in self.scene.clutter.boxes:
-            for axis in range(3):
-                for end in (0, 3):
-                    offset = float(box[axis + end])
-                    if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
-                        continue
-                    plane = torch.zeros(4, dtype=torch.float64)
-                    plane[axis], plane[3] = 1.0, offset
-                    corners = box.view(2, 3) @ tangents(plane).T
-                    patch = torch.cat([corners.amin(0), corners.amax(0)])
-                    mirror = SmallMirror(plane, patch, 0.0)
-                    if not any(same_mirror(mirror, other, SAME_FACE_M) for other in self.tried):
-                        mirrors.append(mirror)
+        for box, axis, end in product(self.scene.clutter.boxes, range(3), (0, 3)):
+            offset = float(box[axis + end])
+            if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
+                continue
+            plane = torch.zeros(4, dtype=torch.float64)
+            plane[axis], plane[3] = 1.0, offset
+            corners = box.view(2, 3) @ tangents(plane).T
+            mirror = SmallMirror(plane, torch.cat([corners.amin(0), corners.amax(0)]), 0.0)
+            if not any(mirror.same(other, SAME_FACE_M) for other in self.tried):
+                mirrors.append(mirror)
         self.tried += mirrors
         return mirrors
 
@@ -227,9 +214,8 @@ class _ClutterSearcher:
         moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
         planes = mirror.plane.repeat(len(moves), 1)
         planes[:, 3] += moves
-        scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
-        first = len(scene.planes)
-        sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
+        scene, first = self.scene, len(self.scene.planes)
+        sequences = [word for i in range(len(moves)) for word in _sequences_over(first + i, scene.walls)]
         trial = replace(scene, planes=torch.cat([scene.planes, planes])).over(sequences)
         paths = trial.unfolding.paths(self.rows.position)
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
@@ -243,14 +229,11 @@ class _ClutterSearcher:
     def _add_mirror(self, mirror: SmallMirror) -> bool:
         """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
         scene, number = self.scene, len(self.scene.planes)
-        sequences = _sequences_over(number, walls(scene.planes, scene.sequences))
+        sequences = _sequences_over(number, scene.walls)
         endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
         trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
-        if self._wide(mirror) and self._add(
-            endless, sequences, 1.5, WALL * self.parameter_cost, len(sequences)
-        ):
-            return True
-        return self._add(trial, sequences, 1.5, MIRROR * self.parameter_cost, len(sequences))
+        wall = self._wide(mirror) and self._add(endless, sequences, 1.5, WALL, len(sequences))
+        return wall or self._add(trial, sequences, 1.5, MIRROR, len(sequences))
 
     def _wide(self, mirror: SmallMirror) -> bool:
         """Whether a mirror covers most of the room."""
@@ -278,30 +261,25 @@ class _ClutterSearcher:
         return torch.polar(torch.ones(()), expected)
 
     def _add(
-        self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
+        self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, most: int
     ) -> bool:
-        """Try sequences of at least `min_score` nats, on a scene that may have more planes and patches."""
+        """Try sequences of at least `min_score` nats, on a scene of so many more parameters of planes."""
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
         scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
-        clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
-        chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, min_score)
+        chosen = pick_apart(sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         more = [sequences[i] for i in chosen]
-        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), least)
+        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), parameters)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
-        scene, scorer = self.scene, self._scorer()
-        visible_waves, patches = self.waves * self.visible.T, []
-        for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
-            patch, score = find_patch(
-                scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
-                self.generator,
-            )  # fmt: skip
+        left, patches = self._left(), []
+        for number in set(range(len(self.scene.planes))) - set(self.scene.clutter.plane):
+            patch, score = find_patch(left, number)
             patches.append((score, number, patch))
         for score, number, patch in sorted(patches, key=lambda f: -f[0]):
             if score < MIN_GAIN:
@@ -311,30 +289,24 @@ class _ClutterSearcher:
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
             trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
-            self._try(trial, PATCH * self.parameter_cost, exact=True)
+            self._try(trial, PATCH, exact=True)
 
     def _boxes(self) -> None:
         for _ in range(BOXES):
-            box, score = find_box(
-                self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator
-            )
+            box, score = find_box(self._left())
             if score < MIN_GAIN:
                 break
-            clutter = self.scene.clutter.with_box(box)
-            if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
+            if not self._try(replace(self.scene, clutter=self.scene.clutter.with_box(box)), BOX):
                 break
 
     def _sequences(self) -> None:
         """Try more sequences over the present planes."""
-        scene, known = self.scene, set(self.scene.sequences)
-        indices = list(range(len(scene.planes)))
-        longer = [(*w, i) for w in scene.sequences if 0 < len(w) < 3 for i in indices if w[-1] != i]
-        sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
+        scene, sequences = self.scene, self.scene.longer(ORDER)
         if not sequences:
             return
-        scores, _ = self._scorer().score_waves(scene.over(sequences).unobstructed(self.rows))
+        scores, _ = self._left().scorer.score_waves(scene.over(sequences).unobstructed(self.rows))
         best = scores.topk(min(60, len(sequences))).indices.tolist()
-        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
+        self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
@@ -345,10 +317,7 @@ class _ClutterSearcher:
         own = self.scene.clutter.boxes[number]
         self._set_clutter(self.scene.clutter.without(number))
         near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
-        box, _ = find_box(
-            self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
-            draws=400, parents=8, seeds=torch.cat([own[None], near]),
-        )  # fmt: skip
+        box, _ = find_box(self._left(), draws=400, parents=8, seeds=torch.cat([own[None], near]))
         self._set_clutter(self.scene.clutter.with_box(box, number))
 
     def _set_clutter(self, clutter: Clutter) -> None:

@@ -7,7 +7,7 @@ which of them a receiver sees follows from where the line to the image meets the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise, permutations
 
 import torch
@@ -50,9 +50,13 @@ class Paths:
         return Paths(self.points[sequences], self.plane[sequences], self.valid[sequences])
 
 
-@dataclass(frozen=True)
 class Unfolding:
     """All orders of the planes of K sequences with the same image, prepared for unfolding.
+
+    Args:
+        transmitter: (3,) float64 [m], or each source's own (K, 3).
+        planes: (P, 4) float64.
+        sequences: K of them.
 
     Attributes:
         chain: (L, K, M, 1, 3) float32 [m]; entry l is the image after l reflections.
@@ -64,61 +68,26 @@ class Unfolding:
         present: (K, M, 1) bool, whether the entry exists.
     """
 
-    chain: Tensor
-    normal: Tensor
-    offset: Tensor
-    height: Tensor
-    plane: Tensor
-    present: Tensor
-
-    @staticmethod
-    def of(transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> Unfolding:
-        """From a scene's transmitter (3,), planes (P, 4) and sequences."""
+    def __init__(self, transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> None:
         variants = _equivalent_sequences(transmitter, planes, sequences)
         most, order = max(map(len, variants)), max(map(len, sequences), default=0)
         plane = torch.full((order, len(sequences), most, 1), -1)
-        present = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
+        self.present = torch.zeros(len(sequences), most, 1, dtype=torch.bool)
         for k, mine in enumerate(variants):
             for m, sequence in enumerate(mine):
                 plane[: len(sequence), k, m, 0] = torch.tensor(sequence, dtype=torch.long)
-                present[k, m] = True
+                self.present[k, m] = True
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
-        chain = [transmitter.expand(*present.shape, 3)]
+        chain = [transmitter.reshape(-1, 1, 1, 3).expand(*self.present.shape, 3)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
         length = torch.linalg.vector_norm(used[..., :3], dim=-1, keepdim=True)
-        normal = (used[..., :3] / length).float() * exists[..., None]
-        offset, images_at = used[..., 3].float() * exists, torch.stack(chain).float()
-        height = (images_at[1:] * normal).sum(-1) - offset
-        met = torch.cat([plane.flip(0), torch.full((1, *present.shape), -1)]).permute(1, 2, 3, 0)
-        return Unfolding(images_at, normal, offset, torch.where(exists, height, -1.0), met, present)
-
-    @staticmethod
-    def concatenate(many: list[Unfolding]) -> Unfolding:
-        """Of several scenes, with consecutive plane indices."""
-        variants = max(u.present.shape[1] for u in many)
-        length = max(len(u.chain) for u in many)
-        parts = zip(*(vars(u.padded(variants, length)).values() for u in many), strict=True)
-        return Unfolding(*(torch.cat(part, 0 if i > 3 else 1) for i, part in enumerate(parts)))
-
-    def padded(self, variants: int, length: int) -> Unfolding:
-        """With room for more variants and reflections."""
-        pad = torch.nn.functional.pad
-        more, longer = variants - self.present.shape[1], length - len(self.chain)
-        chain = torch.cat([self.chain, self.chain[-1:].expand(longer, -1, -1, -1, -1)])
-        return Unfolding(
-            pad(chain, (0, 0, 0, 0, 0, more)),
-            pad(self.normal, (0, 0, 0, 0, 0, more, 0, 0, 0, longer)),
-            pad(self.offset, (0, 0, 0, more, 0, 0, 0, longer)),
-            pad(self.height, (0, 0, 0, more, 0, 0, 0, longer), value=-1.0),
-            pad(self.plane, (longer, 0, 0, 0, 0, more), value=-1),
-            pad(self.present, (0, 0, 0, more)),
-        )
-
-    def with_offset(self, first: int) -> Unfolding:
-        """Plane indices increased by `first`."""
-        return replace(self, plane=torch.where(self.plane >= 0, self.plane + first, -1))
+        self.normal = (used[..., :3] / length).float() * exists[..., None]
+        self.offset, self.chain = used[..., 3].float() * exists, torch.stack(chain).float()
+        height = (self.chain[1:] * self.normal).sum(-1) - self.offset
+        self.height = torch.where(exists, height, -1.0)
+        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).permute(1, 2, 3, 0)
 
     def paths(self, places: Tensor) -> Paths:
         """From places (n, 3) [m]."""
@@ -151,14 +120,14 @@ def _equivalent_sequences(
 ) -> list[list[Reflections]]:
     """Each sequence, then its permutations with the same image."""
     groups = []
-    for sequence in sequences:
+    for start, sequence in zip(transmitter.expand(len(sequences), 3), sequences, strict=True):
         others = [
             other
             for other in dict.fromkeys(permutations(sequence))
             if other != sequence and all(a != b for a, b in pairwise(other))
         ]
         if others:
-            places = images(transmitter, planes, [sequence, *others])
+            places = images(start, planes, [sequence, *others])
             same = (places[1:] - places[0]).norm(dim=1) < SAME_M
             others = [other for other, alike in zip(others, same.tolist(), strict=True) if alike]
         groups.append([sequence, *others])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -21,7 +22,7 @@ from gsparc.processes.trend import Walls
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
 MOST_SEQUENCES = 3_000  # sequences of walls of each length that are looked at, over the largest of them
 LOOKED_FROM = 100  # places
-SEQUENCES_AT_ONCE = 400
+SEQUENCES_AT_ONCE, SEEN_AT_ONCE = 400, 50
 SHORTLIST = 4  # times as many as are wanted, before what walls hide is looked at
 SEEN = 1e-3  # mean share of an image that is kept
 HIDES = 0.01  # share of one image that a rectangle takes, to be kept
@@ -85,6 +86,86 @@ class Mirrors:
                 size[plane] = size.get(plane, 0.0) + one * other
         return sorted(size, key=lambda plane: -size[plane])
 
+    def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Paths:
+        """From places (n, 3) to the transmitter (3,) float64 [m]."""
+        return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
+
+    def visible_sequences(
+        self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool
+    ) -> tuple[Reflections, ...]:
+        """At most `most` sequences, the static end's own first, then by power expected at the places.
+
+        Args:
+            indices: planes that mirror, the largest first.
+            transmitter: (3,) float64 [m].
+            places: (n, 3) float64 [m] of receivers.
+            order: largest number of reflections.
+            most: sequences.
+            hidden: whether walls end and hide; else every image is seen from everywhere.
+        """
+        places = places[torch.linspace(0, len(places) - 1, min(LOOKED_FROM, len(places))).long()]
+        candidates = [
+            sequence
+            for length in range(1, order + 1)
+            for sequence in all_sequences(indices[: affordable(len(indices), length)], length)
+            if len(sequence) == length
+        ]
+        sequences = _distinct(candidates, transmitter, self.planes)
+        if not sequences or most < 2:
+            return ((),)
+
+        def each(said: Callable[..., Tensor], numbers: Tensor, at_once: int) -> Tensor:
+            """What is said of some sequences, so many at once."""
+            parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(at_once))
+            return torch.cat([said(part, transmitter, places, hidden) for part in parts])
+
+        scores = each(self._power, torch.arange(len(sequences)), SEQUENCES_AT_ONCE)
+        best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
+        best = best[scores[best] > 0]
+        if hidden and len(best):
+            seen = each(self._share, best, SEEN_AT_ONCE)
+            best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
+            best = best[power.argsort(descending=True)]
+        return ((), *(sequences[i] for i in best[: most - 1].tolist()))
+
+    def hiding(self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor) -> Clutter:
+        """The rectangles that sequences are mirrored in or that hide one from a place, and the boxes."""
+        clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
+        used = {index for sequence in sequences for index in sequence}
+        numbers = []
+        for number, plane in enumerate(clutter.plane):
+            one = Clutter(clutter.boxes[:0], clutter.patches[number : number + 1], (plane,))
+            shadow = 1 - visible_share(paths, one, self.planes)
+            if plane in used or float(shadow.max()) > HIDES:
+                numbers.append(number)
+        kept = tuple(clutter.plane[i] for i in numbers)
+        return replace(clutter, patches=clutter.patches[numbers], plane=kept)
+
+    def _power(
+        self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
+    ) -> Tensor:
+        """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
+        away = torch.cdist(images(transmitter, self.planes, sequences), places).clamp_min(0.1)
+        order = torch.tensor([len(sequence) for sequence in sequences])
+        power = away.square().reciprocal()
+        if hidden:
+            power = power * self._reflected(self.paths(sequences, transmitter, places))
+        return power.mean(1) * REFLECTED ** (2 * order)
+
+    def _reflected(self, paths: Paths) -> Tensor:
+        """Whether (W, n) every leg of a sequence ends on a rectangle of its plane, as 0 and 1."""
+        inside = paths.plane < 0
+        for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):
+            here = paths.plane == plane
+            if bool(here.any()):
+                met = paths.end[here] @ tangents(self.planes[plane]).T
+                inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
+        return (inside.all(-1) & paths.valid).float()
+
+    def _share(self, sequences: list[Reflections], *ends: Tensor) -> Tensor:
+        """Mean visible share (W,) of sequences, walls and boxes in the way included."""
+        return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
+
 
 def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
     """Walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
@@ -135,73 +216,6 @@ def affordable(mirrors: int, length: int) -> int:
     return count
 
 
-def visible_sequences(
-    mirrors: Mirrors,
-    indices: list[int],
-    transmitter: Tensor,
-    places: Tensor,
-    order: int,
-    most: int,
-    hidden: bool,
-) -> tuple[Reflections, ...]:
-    """At most `most` sequences, the static end's own first, then by power expected at the places.
-
-    Args:
-        mirrors: planes and rectangles.
-        indices: planes that mirror, the largest first.
-        transmitter: (3,) float64 [m].
-        places: (n, 3) float64 [m] of receivers.
-        order: largest number of reflections.
-        most: sequences.
-        hidden: whether walls end and hide; else every image is seen from everywhere.
-    """
-    places = places[torch.linspace(0, len(places) - 1, min(LOOKED_FROM, len(places))).long()]
-    candidates = [
-        sequence
-        for length in range(1, order + 1)
-        for sequence in all_sequences(indices[: affordable(len(indices), length)], length)
-        if len(sequence) == length
-    ]
-    sequences = _distinct(candidates, transmitter, mirrors.planes)
-    if not sequences or most < 2:
-        return ((),)
-    every = torch.arange(len(sequences))
-    scores = torch.cat(
-        [
-            _power(mirrors, [sequences[i] for i in part.tolist()], transmitter, places, hidden)
-            for part in every.split(SEQUENCES_AT_ONCE)
-        ]
-    )
-    best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
-    best = best[scores[best] > 0]
-    if hidden and len(best):
-        seen = torch.cat(
-            [
-                _share(mirrors, [sequences[i] for i in part.tolist()], transmitter, places)
-                for part in best.split(50)
-            ]
-        )
-        best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
-        best = best[power.argsort(descending=True)]
-    return ((), *(sequences[i] for i in best[: most - 1].tolist()))
-
-
-def hiding(
-    mirrors: Mirrors, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor
-) -> Clutter:
-    """The rectangles that sequences are mirrored in or that hide one of them from a place, and the boxes."""
-    clutter = mirrors.clutter
-    paths = Unfolding.of(transmitter, mirrors.planes, sequences).paths(places)
-    used = {index for sequence in sequences for index in sequence}
-    numbers = []
-    for number, plane in enumerate(clutter.plane):
-        one = Clutter(clutter.boxes[:0], clutter.patches[number : number + 1], (plane,))
-        shadow = 1 - visible_share(paths, one, mirrors.planes)
-        if plane in used or float(shadow.max()) > HIDES:
-            numbers.append(number)
-    return replace(clutter, patches=clutter.patches[numbers], plane=tuple(clutter.plane[i] for i in numbers))
-
-
 def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor) -> list[Reflections]:
     """One sequence of each image: perpendicular mirrors have the same in both orders."""
     if not sequences:
@@ -216,38 +230,6 @@ def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor)
                 mine.append(i)
         distinct += mine
     return [sequences[i] for i in sorted(distinct)]
-
-
-def _power(
-    mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
-) -> Tensor:
-    """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
-    away = torch.cdist(images(transmitter, mirrors.planes, sequences), places).clamp_min(0.1)
-    order = torch.tensor([len(sequence) for sequence in sequences])
-    power = away.square().reciprocal()
-    if hidden:
-        power = power * _reflected(
-            mirrors, Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
-        )
-    return power.mean(1) * REFLECTED ** (2 * order)
-
-
-def _reflected(mirrors: Mirrors, paths: Paths) -> Tensor:
-    """Whether (W, n) every leg of a sequence ends on a rectangle of its plane, as 0 and 1."""
-    clutter, inside = mirrors.clutter, paths.plane < 0
-    for patch, plane in zip(clutter.patches, clutter.plane, strict=True):
-        here = paths.plane == plane
-        if not bool(here.any()):
-            continue
-        met = paths.end[here] @ tangents(mirrors.planes[plane]).T
-        inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
-    return (inside.all(-1) & paths.valid).float()
-
-
-def _share(mirrors: Mirrors, sequences: list[Reflections], transmitter: Tensor, places: Tensor) -> Tensor:
-    """Mean visible share (W,) of sequences, walls and boxes in the way included."""
-    paths = Unfolding.of(transmitter, mirrors.planes, tuple(sequences)).paths(places)
-    return visible_share(paths, mirrors.clutter, mirrors.planes).mean(1)
 
 
 def start_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:

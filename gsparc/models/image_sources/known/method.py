@@ -15,21 +15,13 @@ from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.ensemble import Look, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
-from gsparc.models.image_sources.known.images import (
-    MOST_PATCHES,
-    Mirrors,
-    affordable,
-    hiding,
-    start_amplitudes,
-    visible_sequences,
-)
+from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene, direct_amplitude
-from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
+from gsparc.models.image_sources.search import NOISE, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
-from gsparc.models.image_sources.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
@@ -60,16 +52,15 @@ class KnownWallsGP(ImageSourceGP):
     def __init__(self, walls: SceneWalls, **rest: Any) -> None:
         super().__init__(**{**rest, "searches": 1})
         self.walls = walls
-        if self.clutter:
-            self.settings = replace(self.settings, visibility=KERNEL)
+        self.kernel = KERNEL if self.settings.clutter else KernelVisibility()
 
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
-        cache: SearchCache, look: Look | None = None,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
+        look: Look | None = None,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
         rows = row_sets[0]
-        start = self._scene(rows, settings, clutter)
+        start = self._scene(rows, settings)
 
         def near(values: list[Tensor]) -> Tensor:
             return walls_cost(start.planes, start.sequences, values[1], values[2])
@@ -79,7 +70,7 @@ class KnownWallsGP(ImageSourceGP):
 
         with late_when(budget.over):
             scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
-            scene = learn_visibility(rows, scene, STEPS[1], settings.visibility)
+            scene = learn_visibility(rows, scene, STEPS[1], self.kernel)
             prior = ReflectionPhasePrior.of(scene)
             scene = refine(rows, scene, STEPS[2], both)
         error = left_out_error(rows, scene)
@@ -89,7 +80,7 @@ class KnownWallsGP(ImageSourceGP):
         )  # fmt: skip
         return [Member(scene, error)]
 
-    def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
+    def _scene(self, rows: Rows, settings: SearchSettings) -> Scene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
         assert self.site is not None
         transmitter = self._transmitter()
@@ -103,15 +94,14 @@ class KnownWallsGP(ImageSourceGP):
         if order > 1 and affordable(len(indices), order) < len(indices):
             few = affordable(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
-        hidden = clutter and compact(rows)
-        sequences = visible_sequences(
-            mirrors, indices, transmitter, rows.position, order, settings.max_sources, hidden
-        )
-        obstacles = hiding(mirrors, sequences, transmitter, rows.position) if hidden else Clutter.none()
+        hidden = settings.clutter and compact(rows)
+        ends = transmitter, rows.position
+        sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
+        obstacles = mirrors.hiding(sequences, *ends) if hidden else Clutter.none()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
-            math.log(settings.noise), settings.visibility, noise_floor=self.noise_floor,
+            math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
         return replace(bare, clutter=obstacles).only([*range(len(sequences))], obstacles.plane)

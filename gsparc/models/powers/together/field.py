@@ -22,7 +22,7 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
-from gsparc.models.powers.together.network import Network, by_site, learn_network, network_of
+from gsparc.models.powers.together.network import by_site, learn_network, network_of
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.processes.factor import Factor
@@ -30,6 +30,7 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
 from gsparc.processes.prior import Prior
+from gsparc.processes.sectors import Sectors
 from gsparc.processes.shared import Shared
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -55,7 +56,6 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
     own: Own  # of the stations' own processes
     heard: Terms  # shared terms for stations that have rows
     unheard: Terms  # those for all others
-    network: Network | None  # whose sectors have processes that those of a site share; None: each has its own
 
     def __init__(self, shared: bool = True, seed: int = 0) -> None:
         self.shared, self.seed = shared, seed
@@ -70,7 +70,7 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
     def of(cls, site: Site, places: np.ndarray, own: Own, terms: Terms) -> JointPowerField:
         """One of known settings whose stations share `terms`, to be conditioned."""
         result = cls()
-        result.site, result.places, result.own, result.network = site, places, own, None
+        result.site, result.places, result.own = site, places, own
         result.heard = result.unheard = terms
         return result
 
@@ -95,7 +95,7 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         assert data.site.stations is not None
         self.places, notes = places_of(data, rows)
         every = link_rows(data, rows, self.places)
-        self.network = network = network_of(data, self.places)
+        network = network_of(data, self.places)
         if network is None:
             self.own, remarks = learn_own(every, self.seed, budget)
         else:
@@ -121,6 +121,11 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         if terms.place_db:
             self.unheard = terms.known_at(every, PLACES, self.seed)
         return (*notes, *remarks)
+
+    @property
+    def network(self) -> Sectors | None:
+        """Sectors whose processes those of a site share; None: each station has its own."""
+        return trend if isinstance(trend := self.own.never.trend, Sectors) else None
 
     def size(self) -> int:
         """None: no Gaussians."""
@@ -216,7 +221,6 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
             "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
             "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
             "seed": self.seed, "whole": self.whole,
-            "network": {} if self.network is None else self.network.state(),
             "rows": {str(number): rows for number, rows in self.rows.items()},
         }  # fmt: skip
         if self.posterior is not None and self.elsewhere is not None:
@@ -231,9 +235,7 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         never = Prior.read(state["never"])
         assert never.trend is not None
         self.own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
-        self.heard, self.unheard = (Terms.read(never.trend, state[name]) for name in ("heard", "unheard"))
-        stored = {name: value.numpy() for name, value in state.get("network", {}).items()}
-        self.network = Network(**stored) if stored else None
+        self.heard, self.unheard = (Terms(never.trend, **state[name]) for name in ("heard", "unheard"))
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
         if "processes" in state:
@@ -267,7 +269,7 @@ class JointPowerField(ClosedForm, kind="joint_powers"):
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
         if self.network is None:
             return places, number
-        site = torch.from_numpy(self.network.site)[number.clamp_min(0)]
+        site = self.network.site[number.clamp_min(0)]
         return torch.cat([places, number[:, None].clamp_min(0)], 1), torch.where(number < 0, NEVER, site)
 
     def _by_law(self, moving: Tensor) -> Tensor:

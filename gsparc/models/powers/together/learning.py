@@ -41,6 +41,7 @@ TRIED_PLACES = 300  # that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
+TOLD = 100.0  # amplitudes of a pseudo-value's variance, beyond which it tells nothing (.01 dB)
 WIDEST = 4.0  # factor that variances are corrected by at most
 
 
@@ -91,7 +92,8 @@ class Own:
                 wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
                 known = conditioned(part, Prior(prior.kernel, wide), seed)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
-                places, values, extra = known.rows, known.values(), known.extra
+                told = known.extra <= TOLD
+                places, values, extra = known.rows[told], known.values()[told], known.extra[told]
             result[number] = Exact.of(prior, places, values, extra)
         return Shared(result, self.never, terms.columns)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -23,8 +23,9 @@ from gsparc.models.powers.together.terms import LinkRows
 from gsparc.processes.censored import Sites
 from gsparc.processes.density import Evidence, walked
 from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import apart
 from gsparc.processes.prior import Prior
-from gsparc.processes.sectors import NO_AZIMUTH, SHARED, SHARED_SPREAD, Pairs, SectorKernel, Sectors
+from gsparc.processes.sectors import NO_AZIMUTH, SHARED, SHARED_SPREAD, SectorKernel, Sectors
 from gsparc.processes.trend import LEAST_SPREAD
 from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
@@ -35,6 +36,7 @@ USUAL = (0.0, 0.0, 65.0, 10.0, 0.0)  # of `Stations.sector` where it is not know
 NO_PATTERN = 1e9  # width [deg] of a beam in height whose tilt nobody gave
 ONE_BAND = 1.1  # ratio of carriers of one band
 GAIN_DB = 4.0  # deviation of a sector's level, before it is learned
+LOOSE, LEAST_DB2 = 1.5, 1e-2  # deviation of logarithms of kernels' numbers from usual; least variance
 CONTRADICTED_DEG = 30.0
 SURE = 10.0, 0.1  # nats, and nats a row, by which another azimuth must be likelier
 TURNS, GAINS = torch.arange(-180.0, 180.0, 10.0), torch.arange(-12.0, 12.5, 2.0)
@@ -45,29 +47,8 @@ SHARED_BOUNDS = (0.5, 7.0), (-20.0, 20.0), (-1.0, 1.0), (-1.2, 1.5), (10.0, 40.0
 STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
-@dataclass(frozen=True)
-class Network:
-    """Which of T stations are of one site.
-
-    Attributes:
-        site: (T,) int64.
-        rank: (T,) of each among those of its site.
-        band: (T,) int64.
-        table: (T, 5) float64, as `Sectors.table`.
-    """
-
-    site: np.ndarray
-    rank: np.ndarray
-    band: np.ndarray
-    table: np.ndarray
-
-    def state(self) -> dict[str, Tensor]:
-        """Its arrays."""
-        return {name: torch.from_numpy(value) for name, value in vars(self).items()}
-
-
-def network_of(data: Measurements, places: np.ndarray | None = None) -> Network | None:
-    """The network of the stations; None where neither beams are known, nor lists of sites with several.
+def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
+    """The sectors that stations are; None where neither beams are known, nor lists of sites with several.
 
     Args:
         data: powers of several stations.
@@ -86,7 +67,6 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Network 
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
     if not several and not np.isfinite(sector[:, 0]).any():
         return None  # levels of rows are of lists: a receiver has one for each station
-    rank = np.array([int((site[:t] == site[t]).sum()) for t in range(len(site))])
     band = np.zeros(len(site), np.int64)
     if stations.carrier_hz is not None:
         order = np.argsort(stations.carrier_hz)
@@ -97,17 +77,18 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Network 
     table[:, 3] = np.where(np.isfinite(sector[:, 1]), table[:, 3], NO_PATTERN)
     table[:, 0] = np.where(np.isfinite(sector[:, 0]), sector[:, 0] % 360, NO_AZIMUTH)
     table[:, 4] -= table[:, 4].mean()
-    return Network(site, rank, band, table)
+    which = torch.from_numpy(np.stack([site, band]))
+    return Sectors(0.0, table=torch.from_numpy(table), site=which[0], band=which[1])
 
 
-def by_site(rows: LinkRows, network: Network) -> LinkRows:
+def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
     """The same by sites; places (n, 7) say which station a row is of."""
     places = np.concatenate([rows.places[:, :6], rows.station[:, None]], 1)
-    return replace(rows, places=places, station=network.site[rows.station])
+    return replace(rows, places=places, station=network.site.numpy()[rows.station])
 
 
 def learn_network(
-    rows: LinkRows, network: Network, names: tuple[str, ...], seed: int, budget: TimeBudget | None
+    rows: LinkRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
 ) -> tuple[Prior, list[str]]:
     """The prior of every site of a network, and what must be said of it.
 
@@ -122,26 +103,21 @@ def learn_network(
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few if few.silent.all() else few.loud
     decades = law.decades(torch.from_numpy(loud.places))
-    start = Sectors(
-        0.0, law, float(decades.mean()), max(float(decades.std()), LEAST_SPREAD),
-        table=torch.from_numpy(network.table), rank=torch.from_numpy(network.rank),
-        band=torch.from_numpy(network.band),
+    start = replace(
+        network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
-        shared=torch.tensor(SHARED, dtype=torch.float64), gain=GAIN_DB,
     )  # fmt: skip
     with nullcontext() if budget is None else late_when(budget.over):
         rough, gains, scale = _rough(few, start)
         turned, notes = _turned(few, rough, gains, scale, names)
         if notes:
             rough, gains, scale = _rough(few, turned)
-        prior = _by_evidence(rows, rough, gains, scale, seed)
-    trend, kernel = prior.trend, prior.kernel
-    assert isinstance(trend, Sectors) and isinstance(kernel, SectorKernel)  # type: ignore[unreachable]
-    parts = kernel.amplitude * np.array([*kernel.shares, kernel.noise])
-    site, own, bearing, noise = np.sqrt(parts)
+        trend, kernel = _by_evidence(rows, rough, gains, scale, seed)
+    parts = (*kernel.shares, kernel.noise)
+    site, own, bearing, gain, noise = (math.sqrt(kernel.amplitude * part) for part in parts)
     law_note = (
         f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: exponent "
-        f"{float(trend.shared[0]):.3g}, levels +- {trend.gain:.2g} dB, shadowing of a site {site:.2g} dB over"
+        f"{float(trend.shared[0]):.3g}, levels +- {gain:.2g} dB, shadowing of a site {site:.2g} dB over"
         f" {kernel.lengths[0]:.3g} m, of a sector {own:.2g} dB over {kernel.lengths[1]:.3g} m and"
         f" {bearing:.2g} dB by bearing, noise {noise:.2g} dB"
     )
@@ -151,7 +127,7 @@ def learn_network(
         f"{float(trend.shared[4]):.3g} dB, tilts {float(trend.shared[5]):+.2g} deg"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
-    return prior, [law_note, *aimed, *notes]
+    return Prior(kernel, trend), [law_note, *aimed, *notes]  # type: ignore[arg-type]
 
 
 def _misfit(mean: Tensor, rows: LinkRows, scale: Tensor) -> Tensor:
@@ -164,8 +140,7 @@ def _misfit(mean: Tensor, rows: LinkRows, scale: Tensor) -> Tensor:
 
 def _off(shared: Tensor) -> Tensor:
     """Negative log prior of what sectors share."""
-    usual, spread = (torch.tensor(part, dtype=torch.float64) for part in (SHARED, SHARED_SPREAD))
-    return 0.5 * ((shared - usual) / spread).square().sum()
+    return 0.5 * ((shared - SHARED) / SHARED_SPREAD).square().sum()
 
 
 def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
@@ -195,14 +170,13 @@ def _turned(
         part = rows.at(np.flatnonzero(rows.places[:, 6] == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
             continue
-        places, likely = torch.from_numpy(part.places), []
-        for turn in TURNS.tolist():
-            own = torch.tensor([turn, 0.0, 0.0], dtype=torch.float64)
-            mean = trend.at(places, trend.shared, trend.levels, own) + gains[t] + GAINS[:, None]
-            prior = 0.5 * ((gains[t] + GAINS) / GAIN_DB).square()
-            likely.append(float((_misfit(mean, part, torch.tensor(scale)).sum(1) + prior).min()))
-        best = int(np.argmin(likely))
-        gained, said = likely[len(TURNS) // 2] - likely[best], float(TURNS[best])
+        own = torch.nn.functional.pad(TURNS.double()[:, None], (0, 2))  # neither tilted nor wider
+        mean = trend.at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
+        levels = (gains[t] + GAINS)[:, None]
+        likely = _misfit(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
+        likely = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
+        best = int(likely.argmin())
+        gained, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
         if abs(said) >= CONTRADICTED_DEG and gained > SURE[0] + SURE[1] * len(part.index):
             found = float((table[t, 0] + said) % 360)
             notes.append(
@@ -213,69 +187,52 @@ def _turned(
     return replace(trend, table=table), notes
 
 
-def _by_evidence(rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, seed: int) -> Prior:
+def _by_evidence(
+    rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, seed: int
+) -> tuple[Sectors, SectorKernel]:
     """All settings of largest evidence of some rows of each site."""
-    rows = _whole(rows)
+    rows, bands = _whole(rows), len(rough.levels)
     parts = [_stretches(rows.of(number), LEARNED_ON, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
-    pairs = [Pairs.of(at, at) for at in places]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
-    rough = replace(rough, doubt=torch.zeros(len(SHARED) + len(rough.levels), 0, dtype=torch.float64))
-    own = [rough.columns(at) * rough.unit for at in places]
-    bands, count = len(rough.levels), sum(len(part.index) for part in parts)
-    last: list[list[Sites]] = [[] for _ in parts]
-    kinds = own[0].shape[1] // (int(rough.rank.max()) + 1)
-    is_gain = torch.arange(own[0].shape[1]) % kinds == 0
-
-    def unpacked(at: Tensor) -> tuple[Tensor, ...]:
-        return at.split((len(SHARED), bands, 2, 3, 1, 1))
+    rough = replace(rough, doubt=torch.zeros(len(SHARED) + bands, 0, dtype=torch.float64))
+    own = [gram @ gram.T for gram in map(rough.columns, places)]
+    count, last = sum(map(len, places)), [list[Sites]() for _ in parts]
 
     def covariance(i: int, at: Tensor) -> Tensor:
-        _, _, lengths, variances, noise, gain = unpacked(at)
-        columns = own[i] * torch.where(is_gain, gain.exp() / rough.gain, 1.0)
-        result = SectorKernel.of(pairs[i], lengths.exp(), variances.exp()) + columns @ columns.T
-        return result + noise.exp() * torch.eye(len(columns), dtype=torch.float64)
+        kernel = SectorKernel.of(at)
+        noise = kernel.noise * torch.eye(len(own[i]), dtype=torch.float64)
+        return own[i] + kernel.amplitude * (kernel.between(places[i], places[i]) + noise)
 
     def objective(at: Tensor) -> Tensor:
-        shared, levels = unpacked(at)[:2]
-        total = _off(shared) + 0.5 * ((at[-7:] - usual[-7:]) / loose[-7:]).square().sum()
+        shared, levels, logs = at.split((len(SHARED), bands, len(usual)))
+        total = _off(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum()
         for i, at_ in enumerate(places):
             rest = values[i] - rough.at(at_, shared, levels)
-            total = total + Evidence.apply(covariance(i, at), rest, side[i], last[i])  # type: ignore[no-untyped-call]
+            total = total + Evidence.apply(covariance(i, logs), rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
-    middle = float(np.median(pairs[0].distance.numpy())) or 1.0
-    spread = max(float(gains.std()), 1.0)
-    variance = max(scale**2, 1.0)
+    middle = float(apart(places[0][:, :3], places[0][:, :3]).median()) or 1.0
     bearing = 0.1 if bool((rough.table[:, 0] != NO_AZIMUTH).any()) else 0.5
-    start = np.r_[
-        rough.shared.numpy(), rough.levels.numpy(), np.log([0.1 * middle] * 2),
-        np.log([0.5 * variance, 0.3 * variance, bearing * variance, 0.1 * variance]), math.log(spread),
-    ]  # fmt: skip
-    usual, loose = torch.from_numpy(start), torch.tensor([1.5] * len(start), dtype=torch.float64)
+    site, sector, around, noise = max(scale**2, 1.0) * np.array([0.5, 0.3, bearing, 0.1])
+    numbers = [*[0.1 * middle] * 2, site, sector, around, max(float(gains.var()), 1.0), noise]
+    usual = torch.tensor(numbers, dtype=torch.float64).log()
+    start = torch.cat([rough.shared, rough.levels, usual]).numpy()
     wide = [(-400.0, 400.0)] * bands + [(math.log(middle * 1e-3), math.log(middle * 3))] * 2
-    wide += [(math.log(1e-2), math.log(1e3))] * 4 + [(math.log(0.3), math.log(20.0))]
+    wide += [(math.log(LEAST_DB2), math.log(1e3))] * 5
     best, _ = walked(objective, [start], [*SHARED_BOUNDS, *wide], LOOKS, SETTLED)
-    at = torch.from_numpy(best)
-    shared, levels, lengths, variances, noise, gain = unpacked(at)
+    shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned = replace(rough, shared=shared.clone(), levels=levels.clone())
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
     for i, at_ in enumerate(places):
-        gram, quiet = covariance(i, at), side[i] != 0
+        gram, quiet = covariance(i, logs), side[i] != 0
         if quiet.any():
             gram.diagonal()[quiet] += last[i][0].variance
         columns = Factor.of(gram, "raise").whitened(learned.shared_columns(at_))
         precision += columns.T @ columns
-    doubt = Factor.of(precision, "raise").root.T
-    amplitude = float(variances.exp().sum())
-    shares = (variances.exp() / amplitude).tolist()
-    first, second = lengths.exp().tolist()
-    kernel = SectorKernel(
-        (first, second), (shares[0], shares[1], shares[2]), float(noise.exp()) / amplitude, amplitude
-    )
-    trend = replace(learned, doubt=doubt.contiguous(), gain=float(gain.exp()), unit=math.sqrt(amplitude))
-    return Prior(kernel, trend)  # type: ignore[arg-type]
+    doubt, kernel = Factor.of(precision, "raise").root.T, SectorKernel.read(SectorKernel.of(logs).state())
+    return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel
 
 
 def _whole(rows: LinkRows) -> LinkRows:

@@ -146,14 +146,8 @@ class Terms:
         return Factor.of(gram, "raise")
 
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `read` needs, but for the trend."""
+        """Tensors and numbers that it is made of, but for the trend."""
         return {name: value for name, value in vars(self).items() if name not in ("trend", "_factor")}
-
-    @classmethod
-    def read(cls, trend: Trend, state: dict[str, Any]) -> Terms:
-        """The terms whose `state()` this was."""
-        names = ("nearest", "farthest", "inducing", "length", "place_db")
-        return cls(trend, *(state[name] for name in names))
 
 
 def _decades(trend: Trend, places: Tensor) -> Tensor:

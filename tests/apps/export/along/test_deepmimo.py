@@ -1,7 +1,5 @@
 """A scenario of DeepMIMO, read back as its loader reads it: channels, and geometry of a known mirror."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Taps of known channels, their Doppler, and the file that a link simulator plays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Each baseline places features, and refuses what teaches nothing."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

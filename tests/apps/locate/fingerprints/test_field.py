@@ -1,7 +1,5 @@
 """The field of fingerprints: its moments, its likelihood, what it is stored as."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fingerprints located: places, floors, areas, tracks; how far it is trusted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -11,13 +11,7 @@ from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.known import images as known
-from gsparc.models.image_sources.known.images import (
-    Mirrors,
-    affordable,
-    hiding,
-    start_amplitudes,
-    visible_sequences,
-)
+from gsparc.models.image_sources.known.images import Mirrors, affordable, start_amplitudes
 from gsparc.physics.mirror_planes import images
 
 ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)
@@ -28,7 +22,7 @@ def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = 
     mirrors = Mirrors.of(walls, np.zeros(3))
     transmitter, places = torch.from_numpy(told.tx[0]), torch.from_numpy(told.rx)
     indices = mirrors.mirroring(0.25)
-    return told, mirrors, visible_sequences(mirrors, indices, transmitter, places, order, most, hidden)
+    return told, mirrors, mirrors.visible_sequences(indices, transmitter, places, order, most, hidden)
 
 
 def test_all_images_are_the_simulators_and_as_visible():
@@ -41,7 +35,7 @@ def test_all_images_are_the_simulators_and_as_visible():
         np.abs(told.visible.mean(0)[np.setdiff1d(np.arange(len(true)), apart.argmin(1))]).max(initial=0)
         < 0.05
     )
-    paths = Unfolding.of(transmitter, mirrors.planes, sequences).paths(torch.from_numpy(told.rx))
+    paths = Unfolding(transmitter, mirrors.planes, sequences).paths(torch.from_numpy(told.rx))
     seen = visible_share(paths, mirrors.clutter, mirrors.planes) > 0.5
     assert (seen.numpy() == told.visible[:, apart.argmin(1)].T).mean() > 0.97
 
@@ -60,11 +54,11 @@ def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
     mirrors = Mirrors.of(walls, np.zeros(3))
     far = torch.from_numpy(told.rx[told.rx[:, 0] > told.tx[0, 0] + 0.5])
     transmitter = torch.from_numpy(told.tx[0])
-    sequences = visible_sequences(mirrors, [0], transmitter, far, 2, 20, True)
-    assert sequences == ((),) and len(hiding(mirrors, sequences, transmitter, far).patches) == 1
-    assert len(visible_sequences(mirrors, [0], transmitter, far, 2, 20, False)) == 2
+    sequences = mirrors.visible_sequences([0], transmitter, far, 2, 20, True)
+    assert sequences == ((),) and len(mirrors.hiding(sequences, transmitter, far).patches) == 1
+    assert len(mirrors.visible_sequences([0], transmitter, far, 2, 20, False)) == 2
     behind = far + torch.tensor([-100.0, 0, 0])
-    assert len(hiding(mirrors, sequences, transmitter, behind).patches) == 0
+    assert len(mirrors.hiding(sequences, transmitter, behind).patches) == 0
 
 
 def test_long_sequences_are_of_the_largest_walls():

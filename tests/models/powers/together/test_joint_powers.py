@@ -114,6 +114,21 @@ def test_it_is_the_dense_process():
         assert np.allclose(together.numpy(), known[np.ix_(at, at)], atol=1e-8)
 
 
+def test_all_stations_at_once_are_answered_as_one_by_one():
+    data = town(40)
+    (own, terms), every = prior_of(data), rows_of(data)
+    own = replace(own, heard={})
+    rng = np.random.default_rng(0)
+    known = every.at(np.flatnonzero(rng.random(240) < np.linspace(0.3, 0.9, 6)[every.station]))
+    posterior = own.given(known, terms, 0)
+    places, number = torch.from_numpy(every.places[:15]), torch.from_numpy(every.station[:15])
+    mean, left = posterior.answer(places, number)
+    for one in number.unique().tolist():
+        alone = posterior.answer(places[number == one], number[number == one], exact=True)
+        assert torch.allclose(mean[number == one], alone[0], atol=1e-9)
+        assert torch.allclose(left[number == one], alone[1], rtol=1e-5)
+
+
 def joined(*parts):
     """Rows of all parts as one."""
     columns = zip(*(vars(part).values() for part in parts), strict=True)

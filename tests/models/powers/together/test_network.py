@@ -18,7 +18,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_links
 from gsparc.models.powers.together.network import network_of
 from gsparc.ops import Pose
-from gsparc.processes.sectors import NO_AZIMUTH, SHARED, Pairs, SectorKernel, Sectors
+from gsparc.processes.sectors import NO_AZIMUTH, SectorKernel, Sectors
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -130,8 +130,8 @@ def sectors() -> Sectors:
     """Two sectors of a site."""
     table = torch.tensor([[90.0, 5, 65, 10, 0], [NO_AZIMUTH, 5, 65, 10, 3]], dtype=torch.float64)
     return Sectors(
-        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=table, rank=torch.tensor([0, 1]),
-        band=torch.tensor([0, 0]), shared=torch.tensor(SHARED, dtype=torch.float64),
+        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=table, site=torch.tensor([0, 0]),
+        band=torch.tensor([0, 0]),
         levels=torch.tensor([-50.0], dtype=torch.float64), doubt=torch.zeros(7, 1, dtype=torch.float64),
     )  # fmt: skip
 
@@ -151,10 +151,13 @@ def test_the_pattern_of_a_sector():
 
 
 def test_sectors_of_a_site_share_shadowing():
-    kernel = SectorKernel((50.0, 50.0), (0.5, 0.3, 0.2), 0.1, 20.0)
+    kernel = SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0)
     here, there = places(0, 10.0), places(1, 10.0)
     assert float(kernel.between(here, here)) == pytest.approx(1.0)
     assert float(kernel.between(here, there)) == pytest.approx(0.5)
     both = torch.cat([here, there, places(0, 200.0)])
     assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    assert SectorKernel.read(kernel.state()) == kernel and Pairs.of(here, there).same.item() == 0
+    logs = torch.tensor([50.0, 50, 10, 4, 4, 2, 2]).double().log()
+    for again in (SectorKernel.read(kernel.state()), SectorKernel.of(logs)):
+        assert torch.allclose(again.between(both, both), kernel.between(both, both))
+        assert float(again.noise) == pytest.approx(0.1) and float(again.amplitude) == pytest.approx(20)

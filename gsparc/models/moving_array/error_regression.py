@@ -1,4 +1,4 @@
-"""Error model: expected error at a place, regressed on the leave-one-out errors of training rows.
+"""Expected error at a place, regressed on the leave-one-out errors of training rows.
 
 The posterior variance of a process on images depends on the sampling density alone; errors do not: they are
 large at shadow boundaries and where paths interfere. The logarithm of the leave-one-out relative error is
@@ -41,7 +41,7 @@ def image_features(image: Tensor, added: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ErrorModel(WithKernel):
+class ErrorRegression(WithKernel):
     """The regression.
 
     Attributes:
@@ -103,25 +103,18 @@ class ErrorModel(WithKernel):
         return predicted.clamp(math.log(MIN_ERROR), math.log(MAX_ERROR)).exp() * beyond, nearest
 
 
-def fit_error_model(
-    places: np.ndarray,
-    relative_error: Tensor,
-    features: Tensor,
-    kernel: Kernel,
-    reach: float,
-    prior: float,
-) -> ErrorModel:
+def fit_errors(
+    places: np.ndarray, relative_error: Tensor, features: Tensor, kernel: Kernel, reach: float, prior: float
+) -> ErrorRegression:
     """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
 
-    `kernel`, `reach` and `prior` are `ErrorModel`'s.
+    `kernel`, `reach` and `prior` are `ErrorRegression`'s.
     """
     errors = relative_error.clamp(MIN_ERROR, MAX_ERROR).log()
-    distance, rows = (
-        torch.from_numpy(part)
-        for part in cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))
-    )
+    looked_at = np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1)
+    distance, rows = map(torch.from_numpy, cKDTree(places).query(places, k=looked_at))
     distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
-    known = torch.from_numpy(places)
+    near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
     centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(1e-3)
     standard = ((columns - centre) / scale).double().numpy()
@@ -129,16 +122,10 @@ def fit_error_model(
     residual = errors.numpy() - model.predict(standard)
     # the mean of a relative error is not the exponential of its logarithm's mean (Duan 1983)
     level = float(model.intercept_ + np.log(np.exp(residual).mean()))
-    return ErrorModel(
-        *neighbourhoods(kernel, places), errors, centre, scale, torch.from_numpy(model.coef_).float(),
+    return ErrorRegression(
+        near, _precision(kernel, known[near]), errors, centre, scale, torch.from_numpy(model.coef_).float(),
         columns.amin(0), columns.amax(0), kernel, level, max(float(distance[:, 0].max()), 1e-6), reach, prior,
     )  # fmt: skip
-
-
-def neighbourhoods(kernel: Kernel, places: np.ndarray) -> tuple[Tensor, Tensor]:
-    """`near` and `precision` of an `ErrorModel` of rows at places (n, 3) [m]."""
-    rows = cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS, len(places)) + 1))[1]
-    return torch.from_numpy(rows), _precision(kernel, torch.from_numpy(places[rows]))
 
 
 def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:

@@ -1,0 +1,112 @@
+"""What is known of channels before any row: a sum of terms, relative to each group's scale."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.columns import At, Group
+from gsparc.models.channels.terms import KINDS, Noise
+from gsparc.models.channels.terms.term import ChannelTerm, Frame
+
+T = TypeVar("T", bound=ChannelTerm)
+
+
+@dataclass(frozen=True)
+class ChannelPrior:
+    """Terms, at most one of each kind; isotropic waves and noise are always there."""
+
+    terms: tuple[ChannelTerm, ...]
+
+    def get(self, kind: type[T]) -> T | None:
+        """Return the term of a kind, where there is one."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
+
+    def __getitem__(self, kind: type[T]) -> T:
+        found = self.get(kind)
+        if found is None:
+            raise KeyError(kind.__name__)
+        return found
+
+    def changed(self, *terms: ChannelTerm) -> ChannelPrior:
+        """Return the prior with these in place of their kinds; those without powers are left out."""
+        kinds = {type(term): term for term in (*self.terms, *terms)}
+        ordered = (kinds[kind] for kind in dict.fromkeys([*KINDS, *kinds]) if kind in kinds)
+        return ChannelPrior(tuple(term for term in ordered if len(term.power)))
+
+    def framed(self, **numbers: Any) -> ChannelPrior:
+        """Return the prior with some numbers of `frame` changed."""
+        frame = replace(self.frame, **numbers)
+        return ChannelPrior(tuple(replace(term, frame=frame) for term in self.terms))
+
+    @property
+    def frame(self) -> Frame:
+        """What all terms share."""
+        return self.terms[0].frame
+
+    @property
+    def signals(self) -> tuple[ChannelTerm, ...]:
+        """Terms of the place."""
+        return tuple(term for term in self.terms if term.is_signal)
+
+    @property
+    def is_real(self) -> bool:
+        """Whether all covariances are."""
+        return all(term.is_real for term in self.terms)
+
+    @property
+    def power(self) -> Tensor:
+        """All powers (P,)."""
+        return torch.cat([term.power for term in self.terms])
+
+    @property
+    def noise(self) -> float:
+        """Power of the white noise."""
+        return float(self[Noise].power)
+
+    @property
+    def disturbed(self) -> Tensor:
+        """Variance () of what is no signal."""
+        return torch.cat([term.power for term in self.terms if not term.is_signal]).sum()
+
+    def together(self, a: Sequence[At], b: Sequence[At]) -> Iterator[Tensor]:
+        """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.together`."""
+        for parts in zip(*(term.together(a, b) for term in self.signals), strict=True):
+            yield sum(parts[1:], parts[0]).to(torch.complex128)
+
+    def of_groups(self, groups: Sequence[Group]) -> list[Tensor]:
+        """Return covariances (n, n) complex128 of groups' signals; what equal places share is made once."""
+        alike: dict[tuple[bytes, float], list[int]] = {}
+        for number, group in enumerate(groups):
+            alike.setdefault((group.displacements, group.slot.wavenumber), []).append(number)
+        result: list[Tensor] = [torch.empty(0)] * len(groups)
+        for numbers in alike.values():
+            here = [groups[number] for number in numbers]
+            for number, covariance in zip(numbers, self.together(here, here), strict=True):
+                result[number] = covariance
+        return result
+
+    def disturbance(self, group: Group) -> Tensor:
+        """Return the covariance (n, n) float64 of what is no signal of the place."""
+        parts = [term.covariance(group, group) for term in self.terms if not term.is_signal]
+        return sum(parts[1:], parts[0])
+
+    def variance(self, at: At) -> Tensor:
+        """Return the variance (n,) of the signal."""
+        parts = [term.variance(at) for term in self.signals]
+        return sum(parts[1:], parts[0])
+
+    def state(self) -> dict[str, Any]:
+        """Return what `read` needs."""
+        return {"frame": vars(self.frame), **{type(term).__name__: term.state() for term in self.terms}}
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> ChannelPrior:
+        """Return the prior whose `state()` this was."""
+        frame = Frame(**state["frame"])
+        stored = (kind for kind in KINDS if kind.__name__ in state)
+        return cls(tuple(kind(frame=frame, **state[kind.__name__]) for kind in stored))

@@ -1,0 +1,142 @@
+"""Covariances in a basis of what places can tell apart, and what likelihoods need of them.
+
+The degrees of freedom of waves over a patch grow with its size in wavelengths (R. A. Kennedy et al.,
+"Intrinsic limits of dimensionality and richness in random multipath fields", IEEE Trans. Signal Process. 55
+(2007)) and are often far fewer than rows; the eigenvectors U of the isotropic field hold all of them, and
+outside of them there is noise alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.kernels import smooth
+from gsparc.processes.kernel import apart
+
+FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
+WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
+LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
+LOW = 0.3  # of the rows, columns of a factor beyond which its product takes less time
+
+Cache = dict[Hashable, Any]
+T = TypeVar("T")
+
+
+def cached(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
+    """Return what is kept by a key, made the first time."""
+    if key not in cache:
+        cache[key] = make()
+    kept: T = cache[key]
+    return kept
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Covariances (m, r, r) complex128."""
+
+    matrices: Tensor
+
+    @property
+    def count(self) -> int:
+        """m."""
+        return len(self.matrices)
+
+    def added(self, covariance: Tensor, power: Tensor) -> Tensor:
+        """Return a covariance (r, r), which may be overwritten, with these of powers (m,)."""
+        flat = self.matrices.view(len(power), -1)
+        return covariance.add_((power.to(flat.dtype) @ flat).view(covariance.shape))
+
+    def traces(self, weight: Tensor) -> Tensor:
+        """Return traces (m,) of products with a Hermitian matrix (r, r)."""
+        return (self.matrices.reshape(len(self.matrices), -1) @ weight.T.reshape(-1)).real
+
+    def within(self, mixed: Tensor) -> Dense:
+        """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
+        real, imag = self.matrices.real, self.matrices.imag
+        return Dense(torch.complex(mixed @ real @ mixed.T, mixed @ imag @ mixed.T))
+
+
+@dataclass(frozen=True)
+class Factored:
+    """A covariance F F^H of few columns F (r, q) complex128; methods as of `Dense`."""
+
+    factor: Tensor
+    count: ClassVar[int] = 1
+
+    def added(self, covariance: Tensor, power: Tensor) -> Tensor:
+        """See `Dense`."""
+        return covariance.addmm_(self.factor * power, self.factor.mH)
+
+    def traces(self, weight: Tensor) -> Tensor:
+        """See `Dense`."""
+        return (self.factor.conj() * (weight @ self.factor)).real.sum()[None]
+
+    def within(self, mixed: Tensor) -> Factored:
+        """See `Dense`."""
+        return Factored(mixed.to(torch.complex128) @ self.factor)
+
+
+Piece = Dense | Factored
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Of places that differ by one displacement at most.
+
+    Attributes:
+        key: of the places, then of what else decides the columns.
+        places: (n, D) float64 [m].
+        columns: U (n, r) float64, orthonormal; all of them where compression is not worth it.
+        shared: what bases of several settings share.
+    """
+
+    key: tuple[Hashable, ...]
+    places: Tensor
+    columns: Tensor
+    shared: Cache = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        key: tuple[Hashable, ...], places: Tensor, alike: Callable[[], Tensor], noise: float, shared: Cache
+    ) -> Basis:
+        """Return that of a correlation (n, n) float64 beside `noise`, its share."""
+        size, vectors = torch.linalg.eigh(alike())
+        mask = size > FLOOR * noise
+        whole = int(mask.sum()) > WORTH * len(places)
+        columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]
+        return Basis(key, places, columns, shared)
+
+    def dense(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
+        """Return a piece of covariances (n, n), which equal places and keys share."""
+        return (cached(self.shared, (*self.key, key), lambda: self._dense(matrices())),)
+
+    def _dense(self, matrices: list[Tensor]) -> Dense:
+        return Dense(torch.stack([self.of_rows(matrix) for matrix in matrices]))
+
+    def of_rows(self, matrix: Tensor) -> Tensor:
+        """Return a matrix (n, n) of rows as (r, r) complex128."""
+        if self.columns.shape[1] == len(self.columns):
+            return matrix.to(torch.complex128)
+        if not matrix.is_complex():
+            return (self.columns.T @ matrix @ self.columns).to(torch.complex128)
+        # The basis is real: two real products take half the time of a complex one.
+        return torch.complex(*(self.columns.T @ part @ self.columns for part in (matrix.real, matrix.imag)))
+
+    def factored(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
+        """Return pieces of waves (W, n) whose gains vary over `length` [m]."""
+        roots = cached(self.shared, (self.key[0], length), lambda: self._roots(length))
+        wide = self.columns.T.to(torch.complex128)
+        factors = [wide @ (wave[:, None] * roots) for wave in waves]
+        few = roots.shape[1] <= LOW * len(wide)
+        return tuple(Factored(each) if few else Dense((each @ each.mH)[None]) for each in factors)
+
+    def _roots(self, length: float) -> Tensor:
+        """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
+        size, vectors = torch.linalg.eigh(smooth(apart(self.places, self.places), length))
+        mask = size > LOW_RANK * size[-1]
+        return vectors[:, mask] * size[mask].sqrt()

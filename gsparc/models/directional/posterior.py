@@ -1,0 +1,220 @@
+"""Gains of sources at known places, given who sees which: one regression of the channels.
+
+    h(x, f) = sum_k m_k(x) g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   m_k(x) in {0, 1}
+
+with m known at the receivers and a probability elsewhere. The gains are circular Gaussian processes as in
+`image_sources.gp_likelihood`, nearly constant over places. All share one correlation over places, so that the
+covariance of n rows is one product of waves however many sources there are, and a query's correlations are
+those of one kernel; what is uncertain of a source's place multiplies its own part (`coherence`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from gsparc.models.directional.position_refine import UncertainPositions, coherence
+from gsparc.models.directional.visibility import VisibilityGP
+from gsparc.models.image_sources.gp_likelihood import with_noise
+from gsparc.models.image_sources.rows import Rows
+from gsparc.models.image_sources.scene import steering
+from gsparc.models.in_double import in_double
+from gsparc.physics.waves import ranges, wave
+from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.kernel import apart, matern32_of_squares
+from gsparc.processes.left_out import groups_of, left_out_group
+
+CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
+LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
+NOISES = (0.001, 0.01, 0.05)  # of the rows' power
+ROUNDS = 4  # of expectation maximisation of powers, and choice of the kernel
+
+
+@dataclass(frozen=True)
+class GainKernel:
+    """Covariance of gains over places.
+
+    Attributes:
+        constant: share of the variance that is the same everywhere.
+        length: of the rest [m].
+        noise: variance, in units of the rows' power.
+    """
+
+    constant: float
+    length: float
+    noise: float
+
+    def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(n, m) of places (n, 3) and (m, 3) float64 [m]."""
+        squared = (apart(first, second) / self.length).square()
+        return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
+
+
+KERNELS = tuple(GainKernel(*numbers) for numbers in product(CONSTANTS, LENGTHS_M, NOISES))
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Where channels are asked for, and what depends on geometry alone.
+
+    Attributes:
+        away: (m, K) float64 [m], ranges to the sources.
+        probability: (m, K), of seeing them.
+        correlation: (m, n), of gains with the rows'.
+        retained: (K', m, n), coherence retained under position uncertainty, of uncertain sources.
+    """
+
+    away: Tensor
+    probability: Tensor
+    correlation: Tensor
+    retained: Tensor
+
+
+@dataclass(frozen=True)
+class SightedSources:
+    """Posterior of the gains of K sources given n rows.
+
+    Attributes:
+        rows: in the frame.
+        observer: (n,) int64, number of each row's receiver in `visibility`.
+        positions: of the sources.
+        visibility: of the sources, at receivers and elsewhere.
+        power: (K,) of the gains, before any row.
+        kernel: of all gains.
+    """
+
+    rows: Rows
+    observer: Tensor
+    positions: UncertainPositions
+    visibility: VisibilityGP
+    power: Tensor
+    kernel: GainKernel
+
+    @property
+    def seen(self) -> Tensor:
+        """(n, K) float32 of zeros and ones."""
+        return self.visibility.seen[self.observer].float()
+
+    @property
+    def unobstructed(self) -> Tensor:
+        """Waves (n, K) complex64 of the sources at every row, seen or not."""
+        return steering(self.rows, self.positions.points)
+
+    @cached_property
+    def waves(self) -> Tensor:
+        """The same, zero where a receiver does not see a source."""
+        return self.unobstructed * self.seen
+
+    @cached_property
+    def uncertain(self) -> Tensor:
+        """Indices (K',) of the sources that are not coherent over the rows."""
+        return self.positions.uncertain(self.rows.position, self.rows.frequency)
+
+    @cached_property
+    def phase_vectors(self) -> Tensor:
+        """(K', n, 3) of uncertain sources, see `UncertainPositions.phase_vectors`."""
+        return self.positions.only(self.uncertain).phase_vectors(self.rows.position, self.rows.frequency)
+
+    @cached_property
+    def conditioned(self) -> Conditioned:
+        """The rows given their covariance."""
+        covariance = self._cross(self.waves, self._coherence(), self.power)
+        return with_noise(covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target)
+
+    @cached_property
+    def dual_weights(self) -> Tensor:
+        """(n, K, R, 2), real and imaginary: what each row adds to each source's gain."""
+        weights = (self.power * self.waves.conj())[:, :, None] * self.conditioned.weights[:, None]
+        return torch.view_as_real(weights).contiguous()
+
+    @cached_property
+    def exact(self) -> SightedSources:
+        """The same in float64, of what was computed in float32."""
+        return in_double(self.prepared())
+
+    def prepared(self) -> SightedSources:
+        """Itself, with what all queries need; tensors made within the first might be for inference only."""
+        assert len(self.dual_weights) == len(self.rows)
+        return self
+
+    def learned(self) -> SightedSources:
+        """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        mean_power = float(self.waves.abs().square().sum(1).mean())
+        power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
+        coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
+        for _ in range(ROUNDS):
+            covariance = self._cross(self.waves, coherent, power)
+            tried = {
+                each: with_noise(covariance * shared, each.noise, self.rows.target)
+                for each, shared in correlation.items()
+            }
+            kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
+            # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
+            prior = power * kernel.constant
+            mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
+            known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
+            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+        return replace(self, power=power, kernel=kernel)
+
+    def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
+        """Geometry of places (m, 3) [m] and frequencies (m,) or () [Hz]; probability (m, K) where known."""
+        dtype = self.power.dtype
+        probability = self.visibility.probability(places) if probability is None else probability
+        retained = torch.zeros(0, len(places), len(self.rows), dtype=dtype)
+        if len(self.uncertain):
+            several = self.positions.only(self.uncertain)
+            retained = coherence(several.phase_vectors(places, frequency, dtype), self.phase_vectors)
+        correlation = self.kernel.correlation(places, self.rows.position, dtype)
+        return Arrival(ranges(places, self.positions.points), probability.to(dtype), correlation, retained)
+
+    def at_rows(self, probability: Tensor) -> Arrival:
+        """The rows' own geometry, with the probability (receivers, K) that each sees each source."""
+        return self.at(self.rows.position, self.rows.frequency, probability[self.observer])
+
+    def gains(self, at: Arrival) -> Tensor:
+        """Posterior mean gains (m, K, R) where they are seen."""
+        weights = self.dual_weights
+        gain = (at.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
+        if len(self.uncertain):
+            retained = at.retained * at.correlation
+            gain[:, self.uncertain] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.uncertain])
+        return torch.view_as_complex(gain)
+
+    def variance(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
+        """Expected squared error and expected power (m,); of gains, noise and visibility."""
+        probability, noise = at.probability, self.kernel.noise
+        arriving = wave(at.away, carrier_hz, self.power.dtype)
+        powers = arriving.abs().square() * self.power
+        cross = self._cross(arriving * probability, at.retained, self.power) * at.correlation
+        gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
+        of_visibility = (powers * probability * (1 - probability)).sum(1)
+        return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise
+
+    def left_out(self) -> Tensor:
+        """The rows (n, R), each receiver and its own visibility left out."""
+        at = self.at_rows(self.visibility.left_out)
+        cross = self._cross(self.unobstructed * at.probability, at.retained, self.power) * at.correlation
+        predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
+        for group in groups_of(self.observer.numpy()):
+            own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            predicted[group] -= cross[group] @ (inverse[:, group] @ own)
+        return predicted
+
+    def _correlation(self, kernel: GainKernel) -> Tensor:
+        return kernel.correlation(self.rows.position, self.rows.position)
+
+    def _coherence(self) -> Tensor:
+        return coherence(self.phase_vectors, self.phase_vectors)
+
+    def _cross(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
+        """Covariance (m, n) of waves (m, K) with the rows, before the correlation over places."""
+        uncertain = self.uncertain
+        exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
+        total = (waves * exact) @ self.waves.mH
+        for k, coherent in zip(uncertain.tolist(), retained, strict=True):
+            total += (power[k] * waves[:, k])[:, None] * self.waves[:, k].conj() * coherent
+        return total

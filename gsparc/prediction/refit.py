@@ -1,0 +1,72 @@
+"""A method with what it learned from, to be fitted again without some of it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.inner_folds import InnerFolds, cut_inside
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings
+from gsparc.models.method import Method, Reconditions
+from gsparc.models.per_station import PerStation, for_links, trained_stations
+from gsparc.training.context import FitContext
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A fitted method with what it learned from.
+
+    Attributes:
+        method: fitted on `fold`.
+        make: an unfitted copy of it.
+        data, fold: measurements and their rows.
+        context: of the fit.
+    """
+
+    method: Method
+    make: Callable[[], Method]
+    data: Measurements
+    fold: Fold
+    context: FitContext
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Return those (n,) that were learned from, sorted."""
+        return np.sort(np.concatenate([self.fold.train, self.fold.val]))
+
+    def cut(self, count: int, seed: int, split: SplitSettings | None = None) -> InnerFolds:
+        """Return `count` folds of these rows, cut by `split`; None: as the test rows were."""
+        return cut_inside(self.data, self.fold, split or self.context.split, count, seed)
+
+    def refit(self, fold: Fold, context: FitContext) -> Method:
+        """Return the method fitted anew on a fold."""
+        method = for_links(self.make, self.data)
+        method.fit(self.data, fold, context)
+        return method
+
+    def without(self, fold: Fold, split: SplitSettings | None = None) -> Method:
+        """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
+
+        One that can forget rows does so, with its settings as they are; another one is fitted anew.
+        """
+        if isinstance(self.method, Reconditions):
+            known = np.sort(np.concatenate([fold.train, fold.val]))
+            less = self.method.reconditioned(self.data, known)
+            if less is not None:
+                return less
+        with tempfile.TemporaryDirectory() as folder:
+            context = replace(self.context, run_dir=Path(folder), split=split or self.context.split)
+            return self.refit(fold, context)
+
+    def answerable(self, fold: Fold) -> Fold:
+        """Return a fold without test rows of stations that too few training rows are left of."""
+        if not isinstance(self.method, PerStation):
+            return fold
+        known, _ = trained_stations(self.method.wrapped, self.data, fold)
+        assert self.data.station is not None
+        return replace(fold, test=fold.test[known[self.data.station[fold.test]]])
