@@ -69,7 +69,7 @@ def city(count: int) -> Measurements:
         place[:, :2] += JITTER_M * part.normal(size=(number, 2))
         parts.append(place)
     places = np.concatenate(parts)
-    prior = Prior(Kernel((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
+    prior = Prior(Kernel.matern((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
     posterior = given(prior, Values.of(known, torch.from_numpy(powers)[:, None]), 0)
     with torch.no_grad():
         decibels = posterior.mean_at(torch.from_numpy(places))[:, 0].numpy()

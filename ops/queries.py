@@ -70,7 +70,7 @@ def nearest_weights(
         queries, places: (B, D) and (n, D) float64 [m].
         noise: (n,) float64, variance of each row's value.
         rows: (B, k) int64, the near ones.
-        lengths, shares: of one or two Matern-3/2 [m].
+        lengths, shares: of one or two Matern-3/2, of Matern-1/2 where the length is negative [m].
     """
     weights, known = queries.new_empty(rows.shape), queries.new_empty(len(queries))
     # The kernel sums two: of a single one the second has no share.

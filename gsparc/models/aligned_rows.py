@@ -26,7 +26,7 @@ from gsparc.data.moments import Snapshots, moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning, words
-from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import weights_of
 from gsparc.processes.neighbourhood import covering, spacing
 from gsparc.processes.two_lengths import first_kernel, two_lengths
@@ -198,11 +198,12 @@ class _Rows:
 
     def waves(self, factors: np.ndarray) -> Alignment:
         """From these factors on, by waves from everywhere alike."""
-        weights = self._weights(WaveKernel(2 * math.pi / self.length, 1e3 * self.length, WAVE_NOISE))
+        waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
+        weights = self._weights(Kernel((waves,), WAVE_NOISE))
         factors = self._swept(factors, weights, WAVE_SWEEPS)
         return Alignment(factors, self._error(factors, weights), "carrier")
 
-    def _weights(self, kernel: Kernel | WaveKernel) -> csr_array:
+    def _weights(self, kernel: Kernel) -> csr_array:
         """Weights (n, n) of the neighbours of each row in what the others say of it."""
         index = cKDTree(self.places).query(self.places, k=min(NEIGHBOURS + 1, len(self.places)))[1]
         mine = index == np.arange(len(index))[:, None]

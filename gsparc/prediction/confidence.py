@@ -165,7 +165,8 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.amend(path, {KEY: asdict(trusted)})
+    kernel = None if trusted.kernel is None else trusted.kernel.state()
+    checkpoint.amend(path, {KEY: {**asdict(trusted), "kernel": kernel}})
 
 
 def trusted_of(extra: Mapping[str, Any]) -> Trusted:
@@ -174,7 +175,7 @@ def trusted_of(extra: Mapping[str, Any]) -> Trusted:
     if state is None:
         return Trusted()
     promise = None if state["promise"] is None else Guarantee(**state["promise"])
-    kernel = None if state["kernel"] is None else Kernel(**state["kernel"])
+    kernel = None if state["kernel"] is None else Kernel.read(state["kernel"])
     known = np.asarray(state["known"], np.float64)
     return Trusted(state["kind"], float(state["threshold"]), promise, known, kernel)
 

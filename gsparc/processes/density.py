@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from torch import Tensor
 
 from gsparc.processes.censored import Sites, log_evidence
 from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
-from gsparc.processes.kernel import Kernel, matern_sum, unpacked
+from gsparc.processes.kernel import Kernel
 from gsparc.processes.worker import stop_when_late
 
 BAD = 1e12  # in place of a density where no Cholesky factor exists
@@ -114,23 +116,21 @@ class Profiled(torch.autograd.Function):
         return slopes[0] * ctx.saved_tensors[0], None
 
 
-def gram_of(parameters: Tensor, distance: Tensor, columns: Tensor | None = None) -> Tensor:
-    """Return the covariance (n, n) with noise, of amplitude 1, differentiable in `Kernel.parameters()`.
+def gram_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
+    """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
-    >>> kernel = Kernel.of_one(length=2.0, noise=0.5)
-    >>> gram_of(torch.from_numpy(kernel.parameters()), torch.zeros(1, 1, dtype=torch.float64))
+    >>> gram_of(Kernel.of_one(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
     tensor([[1.5000]], dtype=torch.float64)
 
     Args:
-        parameters: (2,) or (4,) float64.
+        kernel: of stationary terms.
         distance: (n, n) [m].
         columns: (n, P) of terms with unit normal weights; None: none.
     """
-    lengths, shares, noise = unpacked(parameters)
-    total = matern_sum(distance, lengths, shares)
+    total = kernel.correlation(distance)
     if columns is not None:
         total = total + columns @ columns.T
-    return total + noise * torch.eye(len(distance), dtype=distance.dtype)
+    return total + kernel.noise * torch.eye(len(distance), dtype=distance.dtype)
 
 
 def walked(
@@ -155,7 +155,9 @@ def walked(
     """
     low, high = np.array(bounds).T
 
-    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
+    @lru_cache(1 + len(starts))  # the walk begins by asking for the best start again
+    def asked(values: bytes) -> tuple[float, np.ndarray]:
+        point = np.frombuffer(values)
         at = torch.from_numpy(point.copy()).requires_grad_()
         try:
             value = objective(at)
@@ -163,6 +165,9 @@ def walked(
             return BAD, np.zeros(len(point))
         (slope,) = torch.autograd.grad(value, at)
         return float(value.detach()), slope.numpy()
+
+    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
+        return asked(point.tobytes())
 
     points = [np.clip(start, low, high) for start in starts]
     start = min(points, key=lambda point: ask(point)[0]) if len(points) > 1 else points[0]
@@ -173,6 +178,25 @@ def walked(
     return result.x, float(result.fun)
 
 
+def learned(
+    objective: Callable[[Kernel], tuple[Tensor, Tensor]], starts: Sequence[Kernel],
+    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+) -> tuple[float, Kernel]:  # fmt: skip
+    """Find where an objective of kernels is least, and the kernel there, from the best of `starts` on.
+
+    Args:
+        objective: its value, with autograd, and the best amplitude.
+        starts: of terms of one kind.
+        bounds, looks, tolerance: see `walked`.
+    """
+    first, points = starts[0], [one.parameters().numpy() for one in starts]
+    best, _ = walked(lambda at: objective(first.at(at))[0], points, bounds, looks, tolerance)
+    with torch.no_grad():
+        kernel = first.at(torch.from_numpy(best))
+        value, amplitude = objective(kernel)
+    return float(value), replace(kernel, amplitude=float(amplitude))
+
+
 def by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
     bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
@@ -180,30 +204,10 @@ def by_left_out(
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel."""
 
-    def objective(at: Tensor) -> Tensor:
-        gram = gram_of(at, distance, columns)
-        return LeftOutDensity.apply(gram, values, entries, bounded)[0] / len(values)  # type: ignore[no-untyped-call]
-
-    best, _ = walked(objective, [one.parameters() for one in starts], bounds, looks, tolerance)
-    with torch.no_grad():
-        gram = gram_of(torch.from_numpy(best), distance, columns)
+    def objective(kernel: Kernel) -> tuple[Tensor, Tensor]:
+        gram = gram_of(kernel, distance, columns)
         value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
-    return float(value), Kernel.of(best, float(amplitude))
+        return value / len(values), amplitude
 
-
-def by_evidence(
-    start: Kernel, distance: Tensor, values: Tensor, bounds: Sequence[tuple[float, float]], looks: int,
-    tolerance: float,
-) -> Kernel:  # fmt: skip
-    """Return the kernel of largest evidence for values (n, P) of mean 0, its amplitude too, from `start` on.
-
-    Rasmussen and Williams 2006, eq. 5.8; distances (n, n) [m] of the places, bounds of `Kernel.parameters()`.
-    """
-
-    def objective(at: Tensor) -> Tensor:
-        return Profiled.apply(gram_of(at, distance), values)[0]  # type: ignore[no-untyped-call]
-
-    best, _ = walked(objective, [start.parameters()], bounds, looks, tolerance)
-    with torch.no_grad():
-        gram = gram_of(torch.from_numpy(best), distance)
-        return Kernel.of(best, float(Profiled.apply(gram, values)[1]))  # type: ignore[no-untyped-call]
+    value, kernel = learned(objective, starts, bounds, looks, tolerance)
+    return value * len(values), kernel

@@ -9,15 +9,16 @@ variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import ROUGH_RATIO, ROUGH_SHARE, apart, matern32, smooth_rough
+from gsparc.processes.kernel import ROUGH_RATIO, ROUGH_SHARE, Shadowing, SmoothRough, apart
 
 Correlation = Literal["matern32", "smooth_rough"]
+TERMS = {"matern32": Shadowing, "smooth_rough": SmoothRough}
 
 ENOUGH = 0.5  # of the noise: a row this well known from the places before it is no further place
 JITTER = 1e-8  # of the unit variance: places lie apart, this covers rounding
@@ -33,11 +34,9 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     Raises:
         ValueError: another name.
     """
-    if name == "matern32":
-        return matern32(apart(a, b), length)
-    if name != "smooth_rough":
-        raise ValueError(f"correlation {name!r} is none of {', '.join(get_args(Correlation))}")
-    return smooth_rough(apart(a, b), length)
+    if name not in TERMS:
+        raise ValueError(f"correlation {name!r} is none of {', '.join(TERMS)}")
+    return TERMS[name](length).correlation(apart(a, b))
 
 
 def parts_of(length: float, name: Correlation) -> tuple[float, float, float, float]:

@@ -1,23 +1,26 @@
-"""Correlations of places: one or more Matern parts, differentiable in places, lengths and shares."""
+"""Terms that depend on distance, and their sum with noise: differentiable in places, lengths and shares."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.ops.transforms import beyond_kernels
+from gsparc.processes.term import Term, restored, stored
 
 LENGTH_SPAN = (1e-3, 3.0)  # bounds of a length, of the median distance between rows
 NOISE_SPAN = (1e-6, 1e2)  # bounds of the noise's variance, of the amplitude
 SHARES = 6.0  # bound of the logit of a share
 ROUGH_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
 ROUGH_RATIO = 1 / 3  # of the lengths
+COMPILED = 2  # terms that compiled kernels sum
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
@@ -66,59 +69,186 @@ def matern52(distance: Tensor, length: Tensor | float) -> Tensor:
     return torch.addcmul(torch.sub(ONE, scaled), scaled, scaled, value=1 / 3) * scaled.exp()
 
 
-def matern_sum(
-    distance: Tensor, lengths: Sequence[Tensor | float], shares: Sequence[Tensor | float]
-) -> Tensor:
-    """Return the sum of Matern-3/2 correlations of several lengths [m] at distances (...) [m].
+@dataclass(frozen=True)
+class Stationary(Term[Tensor]):
+    """A term of places that depends on their distance alone.
 
-    >>> matern_sum(torch.tensor([0.0, 2.0]), lengths=(2.0, 20.0), shares=(0.5, 0.5))
-    tensor([1.0000, 0.7350])
+    Attributes:
+        length: [m].
+        share: variance, of that of all such terms of a kernel.
     """
-    if len(lengths) == 1:
-        return matern32(distance, lengths[0])
-    parts = zip(lengths, shares, strict=True)
-    return sum((share * matern32(distance, length) for length, share in parts), torch.zeros_like(distance))
+
+    length: Tensor | float
+    share: Tensor | float = 1.0
+    by_distance: ClassVar[bool] = True  # also where both ends move
+    compiled: ClassVar[int] = 0  # sign of its length in compiled kernels; 0: they do not know it
+
+    @abstractmethod
+    def correlation(self, distance: Tensor) -> Tensor:
+        """Return correlations at distances (...) [m]."""
+
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """See `Term`."""
+        return self.share * self.correlation(apart(a, b))
+
+    def variance(self, a: Tensor) -> Tensor:
+        """See `Term`."""
+        return self.share * a.new_ones(len(a))
+
+    def parameters(self) -> Tensor:
+        """Return the logarithm of the length (1,); shares are learned by the sum."""
+        return torch.tensor([self.length], dtype=torch.float64).log()
+
+    def bounds(self, scale: float) -> list[tuple[float, float]]:
+        """See `Term`."""
+        return [(math.log(scale * LENGTH_SPAN[0]), math.log(scale * LENGTH_SPAN[1]))]
+
+    def at(self, parameters: Tensor) -> Self:
+        """See `Term`."""
+        return replace(self, length=parameters[0].exp())
+
+    def state(self) -> dict[str, Any]:
+        """See `Term`."""
+        return {name: float(value) for name, value in vars(self).items()}
 
 
-def smooth_rough(distance: Tensor, length: float) -> Tensor:
-    """Return a smooth long part, Matern-5/2, and a rough short one, Matern-3/2 of a third of `length`."""
-    return torch.lerp(matern52(distance, length), matern32(distance, ROUGH_RATIO * length), ROUGH_SHARE)
+class Shadowing(Stationary):
+    """Shadows of `length`, Matern-3/2: values have a slope.
+
+    >>> Shadowing(2.0).correlation(torch.tensor([0.0, 2.0]))
+    tensor([1.0000, 0.4834])
+    """
+
+    compiled = 1
+
+    def correlation(self, distance: Tensor) -> Tensor:
+        """See `Stationary`."""
+        return matern32(distance, self.length)
+
+
+class ExponentialShadowing(Stationary):
+    """Shadows of `length`, Matern-1/2: rough at any scale (M. Gudmundson, Electronics Letters 27 (1991)).
+
+    >>> ExponentialShadowing(2.0).correlation(torch.tensor([0.0, 2.0]))
+    tensor([1.0000, 0.3679])
+    """
+
+    compiled = -1
+
+    def correlation(self, distance: Tensor) -> Tensor:
+        """See `Stationary`."""
+        return (distance * (-1 / self.length)).exp()
+
+
+class SmoothRough(Stationary):
+    """A smooth long part, Matern-5/2, and a rough short one, Matern-3/2 of a third of `length`."""
+
+    def correlation(self, distance: Tensor) -> Tensor:
+        """See `Stationary`."""
+        rough = matern32(distance, ROUGH_RATIO * self.length)
+        return torch.lerp(matern52(distance, self.length), rough, ROUGH_SHARE)
+
+
+@dataclass(frozen=True)
+class IsotropicWaves(Stationary):
+    """`sin(kd) / (kd) Matern-3/2(d / length)`: waves from everywhere alike.
+
+    Where both ends move it is the product over both, as waves leave in all directions as they arrive from all
+    (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
+
+    >>> waves = IsotropicWaves(length=1e6, wavenumber=2 * math.pi)  # of 1 m wavelength
+    >>> waves.covariance(torch.zeros(1, 3), torch.tensor([[0, 0, 0.75], [0.25, 0, 0]])).round(decimals=3)
+    tensor([[-0.2120,  0.6370]])
+
+    Attributes:
+        wavenumber: [rad/m].
+    """
+
+    wavenumber: float = 0.0
+    by_distance = False
+
+    def correlation(self, distance: Tensor) -> Tensor:
+        """See `Stationary`; of one end."""
+        # `torch.sinc` has pi in its argument: sin(pi x) / (pi x).
+        return torch.sinc(distance * (self.wavenumber / math.pi)) * matern32(distance, self.length)
+
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
+        ends = zip(a.split(3, -1), b.split(3, -1), strict=True)
+        first, *other = (self.correlation(apart(*pair)) for pair in ends)
+        return first * other[0] if other else first
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """`amplitude (sum_k share_k Matern-3/2(distance / length_k) + noise identity)`.
+    """`amplitude (sum of terms + noise identity)`.
 
-    >>> kernel = Kernel(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
+    >>> kernel = Kernel.matern(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
     >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))  # one place: its variance and that of the noise
     tensor([[1.1000]], dtype=torch.float64)
-    >>> Kernel.of(kernel.parameters()).parameters().round(3).tolist() == kernel.parameters().round(3).tolist()
+    >>> torch.allclose(kernel.at(kernel.parameters()).parameters(), kernel.parameters())
     True
 
     Attributes:
-        lengths: one or two [m].
-        shares: of the same number, they sum to 1.
+        terms: whose shares sum to 1; several of distance alone, or one.
         noise: variance relative to `amplitude`.
         amplitude: variance of a value.
     """
 
-    lengths: tuple[float, ...]
-    shares: tuple[float, ...]
-    noise: float
+    terms: tuple[Stationary, ...]
+    noise: float  # a tensor while it is learned
     amplitude: float = 1.0
 
     @classmethod
-    def of_one(cls, length: float, noise: float, amplitude: float = 1.0) -> Self:
-        """Return a kernel with one length [m]."""
-        return cls((length,), (1.0,), noise, amplitude)
+    def of_one(
+        cls, length: float, noise: float, amplitude: float = 1.0, term: type[Stationary] = Shadowing
+    ) -> Self:
+        """Return a kernel of one term of a length [m]."""
+        return cls((term(length),), noise, amplitude)
+
+    @classmethod
+    def matern(
+        cls, lengths: Sequence[float], shares: Sequence[float], noise: float, amplitude: float = 1.0
+    ) -> Self:
+        """Return a kernel of several `Shadowing`."""
+        return cls(tuple(map(Shadowing, lengths, shares)), noise, amplitude)
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """Of the terms [m]."""
+        return tuple(float(term.length) for term in self.terms)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Of the terms."""
+        return tuple(float(term.share) for term in self.terms)
+
+    @property
+    def length(self) -> float:
+        """The first [m]."""
+        return self.lengths[0]
+
+    @property
+    def compiled(self) -> list[float] | None:
+        """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
+        signed = [term.compiled * float(term.length) for term in self.terms]
+        return signed if all(signed) and len(signed) <= COMPILED else None
+
+    @property
+    def by_distance(self) -> bool:
+        """Whether distances are all that counts, also where both ends move."""
+        return self.terms[0].by_distance
 
     def correlation(self, distance: Tensor) -> Tensor:
         """Return correlations at distances (...) [m]."""
-        return matern_sum(distance, self.lengths, self.shares)
+        if len(self.terms) == 1:
+            return self.terms[0].correlation(distance)
+        first, *others = (term.share * term.correlation(distance) for term in self.terms)
+        return sum(others, first)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(apart(a, b))
+        return self.correlation(apart(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
@@ -126,102 +256,42 @@ class Kernel:
         result.diagonal().add_(self.noise)
         return result
 
-    @property
-    def length(self) -> float:
-        """The first [m]."""
-        return self.lengths[0]
+    def parameters(self) -> Tensor:
+        """Return logarithms of lengths and noise, between them those of shares relative to the last."""
+        shares, noise = torch.tensor(self.shares).double().log(), torch.tensor([self.noise]).double().log()
+        lengths = [term.parameters() for term in self.terms]
+        return torch.cat([*lengths, shares[:-1] - shares[-1], noise])
 
-    def state(self) -> dict[str, list[float]]:
+    def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
+        """Return bounds of the parameters, for rows at distances (...) [m].
+
+        >>> [round(low, 2) for low, _ in Kernel.of_one(1.0, 1.0).bounds(torch.tensor([10.0]))]
+        [-4.61, -13.82]
+        """
+        # All rows may stand at one place, whose distances are 0.
+        scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
+        lengths = [bound for term in self.terms for bound in term.bounds(scale)]
+        shares = [(-SHARES, SHARES)] * (len(self.terms) - 1)
+        return [*lengths, *shares, (math.log(NOISE_SPAN[0]), math.log(NOISE_SPAN[1]))]
+
+    def at(self, parameters: Tensor) -> Self:
+        """Return the kernel of other parameters; numbers are tensors where gradients flow."""
+        count = len(self.terms)
+        lengths, logits, noise = parameters.split((count, count - 1, 1))
+        # Of logits all shares lie between 0 and 1, whatever a step does.
+        shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
+        given = zip(self.terms, lengths.split(1), shares, strict=True)
+        terms = tuple(replace(term.at(length), share=share) for term, length, share in given)
+        result = replace(self, terms=terms, noise=noise[0].exp())  # type: ignore[arg-type]
+        return result if parameters.requires_grad else self.read(result.state())
+
+    def state(self) -> dict[str, Any]:
         """Return numbers that `read` needs."""
-        return {
-            "lengths": [*self.lengths], "shares": [*self.shares], "kernel": [self.noise, self.amplitude]
-        }  # fmt: skip
+        terms, noise = [stored(term) for term in self.terms], float(self.noise)
+        return {"terms": terms, "noise": noise, "amplitude": self.amplitude}
 
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
         """Return the kernel whose `state()` this was."""
-        lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
-        return cls(lengths, shares, *(float(v) for v in state["kernel"]))
-
-    def parameters(self) -> np.ndarray:
-        """Return logarithms of lengths and noise, between them the logit of the first share of two."""
-        logit = [math.log(self.shares[0] / self.shares[1])] if len(self.shares) == 2 else []
-        return np.array([*np.log(self.lengths), *logit, math.log(self.noise)])
-
-    @classmethod
-    def of(cls, parameters: np.ndarray, amplitude: float = 1.0) -> Self:
-        """Return the kernel whose `parameters()` these are."""
-        lengths, shares, noise = unpacked(torch.from_numpy(np.asarray(parameters, np.float64)))
-        return cls(tuple(map(float, lengths)), tuple(map(float, shares)), float(noise), amplitude)
-
-
-@dataclass(frozen=True)
-class WaveKernel:
-    """`amplitude (sin(kd) / (kd) Matern-3/2(d / length) + noise identity)`: waves from everywhere alike.
-
-    Where both ends move it is the product over both, as waves leave in all directions as they arrive from all
-    (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
-
-    >>> kernel = WaveKernel(wavenumber=2 * math.pi, length=1e6)  # of 1 m wavelength
-    >>> kernel.between(torch.zeros(1, 3), torch.tensor([[0, 0, 0.75], [0.25, 0, 0]])).round(decimals=3)
-    tensor([[-0.2120,  0.6370]])
-
-    Attributes:
-        wavenumber: [rad/m].
-        length: of the envelope [m].
-        noise: variance relative to `amplitude`.
-        amplitude: variance of a complex value.
-    """
-
-    wavenumber: float
-    length: Tensor | float
-    noise: float = 0.0
-    amplitude: float = 1.0
-
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
-        ends = [apart(*pair) for pair in zip(a.split(3, -1), b.split(3, -1), strict=True)]
-        # `torch.sinc` has pi in its argument: sin(pi x) / (pi x).
-        waves = [
-            torch.sinc(each * (self.wavenumber / math.pi)) * matern32(each, self.length) for each in ends
-        ]
-        return waves[0] if len(waves) == 1 else waves[0] * waves[1]
-
-    def state(self) -> dict[str, list[float]]:
-        """Return numbers that `read` needs."""
-        return {"wave": [self.wavenumber, float(self.length), self.noise, self.amplitude]}
-
-    @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Self:
-        """Return the kernel whose `state()` this was."""
-        return cls(*(float(v) for v in state["wave"]))
-
-
-class SmoothRough(Kernel):
-    """The same with one `smooth_rough` part, of array vectors and emissions."""
-
-    def correlation(self, distance: Tensor) -> Tensor:
-        """Return correlations at distances (...) [m]."""
-        return smooth_rough(distance, self.lengths[0])
-
-
-def unpacked(parameters: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
-    """Return lengths, shares and noise of `Kernel.parameters()` (2,) or (4,), differentiable."""
-    if len(parameters) == 2:
-        return [parameters[0].exp()], [torch.ones_like(parameters[0])], parameters[1].exp()
-    # Of a logit both shares lie between 0 and 1, whatever a step does.
-    share = torch.sigmoid(parameters[2])
-    return list(parameters[:2].exp()), [share, 1 - share], parameters[3].exp()
-
-
-def bounds_of(count: int, distance: np.ndarray) -> list[tuple[float, float]]:
-    """Return bounds of the parameters of a kernel of `count` lengths, for rows at distances (...) [m].
-
-    >>> [round(low, 2) for low, high in bounds_of(1, np.array([10.0]))]  # logarithms of length and noise
-    [-4.61, -13.82]
-    """
-    # All rows may stand at one place, whose distances are 0.
-    scale = float(np.median(distance)) or float(distance.max()) or 1.0
-    length = (math.log(scale * LENGTH_SPAN[0]), math.log(scale * LENGTH_SPAN[1]))
-    share = [(-SHARES, SHARES)] if count == 2 else []
-    return [*[length] * count, *share, (math.log(NOISE_SPAN[0]), math.log(NOISE_SPAN[1]))]
+        terms = tuple(restored(one) for one in state["terms"])
+        return cls(terms, float(state["noise"]), float(state["amplitude"]))

@@ -23,9 +23,9 @@ from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
-from gsparc.processes.density import walked
+from gsparc.processes.density import learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
-from gsparc.processes.kernel import Kernel, WaveKernel, apart, bounds_of, matern_sum, unpacked
+from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance
 from gsparc.processes.prior import Answer, Posterior, Prior
 
@@ -52,9 +52,7 @@ def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
     return weights, (weights * cross).sum(-1)
 
 
-def weights_of(
-    kernel: Kernel | WaveKernel, places: Tensor, near: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor]:
+def weights_of(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D) of `noise` (B, k)."""
     gram = kernel.between(near, near)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
@@ -171,10 +169,8 @@ class Nearest(Posterior):
     def _weights(self, queries: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """Of rows (B, k), see `weights_of`."""
         kernel = self.prior.kernel
-        if type(kernel) is Kernel and served(queries):  # a subclass has other correlations
-            result = nearest_weights(
-                queries, self.places, self._solvable, index, kernel.lengths, kernel.shares
-            )
+        if (lengths := kernel.compiled) and served(queries):
+            result = nearest_weights(queries, self.places, self._solvable, index, lengths, kernel.shares)
             if result is None:
                 raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
             return result
@@ -197,14 +193,14 @@ class Nearest(Posterior):
         """See `Posterior`."""
         arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
         parts = {name: getattr(self, name) for name in ("rest", "noise", "terms", "spread")}
-        return {**self.prior.state(), **arrays, **parts, "most": self.most}
+        return {"prior": self.prior.state(), **arrays, **parts, "most": self.most}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Nearest:
         """Return the posterior whose `state()` this was."""
         near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
         rest, noise, terms, spread = (state[name] for name in ("rest", "noise", "terms", "spread"))
-        return cls(Prior.read(state), near, rest, noise, terms, spread, int(state["most"]))
+        return cls(Prior.read(state["prior"]), near, rest, noise, terms, spread, int(state["most"]))
 
 
 def given(
@@ -319,11 +315,11 @@ class Sample:
         )
 
 
-def density_given_nearest(parameters: Tensor, sample: Sample) -> tuple[Tensor, Tensor]:
+def density_given_nearest(kernel: Kernel, sample: Sample) -> tuple[Tensor, Tensor]:
     """Return the negative log density, mean over rows [nats], and the best amplitude."""
-    lengths, shares, noise = unpacked(parameters)
-    gram = matern_sum(sample.apart, lengths, shares) + torch.diag_embed(noise / sample.counts + JITTER)
-    weights, known = solved(gram, matern_sum(sample.far, lengths, shares))
+    noise = kernel.noise
+    gram = kernel.correlation(sample.apart) + torch.diag_embed(noise / sample.counts + JITTER)
+    weights, known = solved(gram, kernel.correlation(sample.far))
     variance = 1 + noise / sample.count - known
     squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
     amplitude = (squared / variance).mean().clamp_min(TINY)
@@ -341,12 +337,8 @@ def most_likely(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> K
         sample: the rows.
         distance: between rows of the whole site [m], for bounds of lengths.
     """
-    bounds = bounds_of(len(starts[0].lengths), distance)
-    points = [one.parameters() for one in starts]
-    best, _ = walked(lambda at: density_given_nearest(at, sample)[0], points, bounds, LOOKS, SETTLED)
-    with torch.no_grad():
-        amplitude = float(density_given_nearest(torch.from_numpy(best), sample)[1])
-    return Kernel.of(best, amplitude)
+    bounds = starts[0].bounds(torch.from_numpy(distance))
+    return learned(lambda one: density_given_nearest(one, sample), starts, bounds, LOOKS, SETTLED)[1]
 
 
 def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
@@ -361,7 +353,6 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
         seed: of what is drawn.
     """
     count, start = len(values.places), prior.kernel
-    assert isinstance(start, Kernel)
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
     chosen = covering(values.places, COVER, seed)
@@ -381,7 +372,7 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     sample = Sample.of(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
-    starts = [Kernel((long * share, long), shares, start.noise, 1.0) for share in SHORTER]
+    starts = [Kernel.matern((long * share, long), shares, start.noise) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"

@@ -15,12 +15,13 @@ from torch import Tensor
 
 from gsparc.processes.conditioned import weighted
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.kernel import apart
 from gsparc.processes.left_out import left_out
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.prior import Answer, Posterior, Prior
 
+BLOCK = 64  # rows of a covariance at a time
 MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
 
 
@@ -28,6 +29,7 @@ MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many o
 class Exact(Posterior):
     """Given n rows with one factor.
 
+    >>> from gsparc.processes.kernel import Kernel
     >>> prior = Prior(Kernel.of_one(length=2.0, noise=0.01))
     >>> places = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)  # on a line [m]
     >>> posterior = Exact.of(prior, places, places.sin())
@@ -86,7 +88,7 @@ class Exact(Posterior):
     @cached_property
     def _near(self) -> Nearest | None:
         """What states the variance of many rows: exactly it costs their number squared for each place."""
-        if len(self.rows) <= MANY or not isinstance(self.prior.kernel, Kernel):
+        if len(self.rows) <= MANY or not self.prior.kernel.by_distance:
             return None
         terms = self.factor.whitened(self._columns)
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
@@ -139,16 +141,26 @@ class Exact(Posterior):
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""
-        return {**self.prior.state(), "places": self.rows, "weights": self.weights, "extra": self.extra}
+        arrays = {"rows": self.rows, "weights": self.weights, "extra": self.extra}
+        return {"prior": self.prior.state(), **arrays}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Exact:
         """Return the posterior whose `state()` this was."""
-        return cls(Prior.read(state), state["places"], state["weights"], state["extra"])
+        return cls(**{**state, "prior": Prior.read(state["prior"])})
+
+
+def posterior_of(state: dict[str, Any]) -> Exact | Nearest:
+    """Return the posterior whose `state()` this was."""
+    return Nearest.read(state) if "level" in state else Exact.read(state)
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
-    gram = prior.between(places, places)
+    gram = places.new_zeros(len(places), len(places))
+    for start in range(0, len(places), BLOCK):
+        part = slice(start, start + BLOCK)
+        # One triangle, all that a factor reads, in blocks that stay in the processor's caches.
+        gram[part, : start + BLOCK] = prior.between(places[part], places[: start + BLOCK])
     gram.diagonal().add_(prior.kernel.noise + extra)
     return Factor.of(gram, "raise")
 

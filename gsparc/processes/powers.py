@@ -17,7 +17,7 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior
+from gsparc.processes.posterior import Exact, Posterior, posterior_of
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
 
@@ -109,9 +109,7 @@ class PowerProcess:
     @property
     def kernel(self) -> Kernel:
         """Of the prior."""
-        kernel = self.posterior.prior.kernel
-        assert isinstance(kernel, Kernel)
-        return kernel
+        return self.posterior.prior.kernel
 
     @property
     def trend(self) -> Trend:
@@ -182,14 +180,13 @@ class PowerProcess:
     def state(self) -> dict[str, Any]:
         """Return tensors and numbers that `read` needs."""
         others = [{**one.state(), "share": share} for share, one in self.others]
-        return {**self.posterior.state(), "heard": self.heard, **({"others": others} if others else {})}
+        return {"posterior": self.posterior.state(), "heard": self.heard, "others": others}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> PowerProcess:
         """Return the process whose `state()` this was."""
-        kind = Nearest if "level" in state else Exact
-        others = tuple((float(one["share"]), cls.read(one)) for one in state.get("others", ()))
-        return cls(kind.read(state), float(state["heard"]), others)
+        others = tuple((float(one["share"]), cls.read(one)) for one in state["others"])
+        return cls(posterior_of(state["posterior"]), float(state["heard"]), others)
 
 
 def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
@@ -207,22 +204,21 @@ def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Ten
     return mean, torch.stack(spread).sum(0)
 
 
-def conditioned(rows: Rows, trend: Trend, kernel: Kernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
-    """Return the process given all rows with settings as they are, and what must be said of the silent ones.
+def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
+    """Return the process given all rows, and what must be said of the silent ones.
 
     Args:
         rows: at least one.
-        trend, kernel: the prior.
+        prior: settings as they are.
         seed: of rows that are drawn where there are too many.
     """
-    prior = Prior(kernel, trend)
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
         return _exact(rows.drawn(MOST_ROWS, seed), prior, seed)
     loud = rows.loud
     values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
-    heard = float((share * (values.values[:, 0] - middle).square()).sum()) / kernel.amplitude
+    heard = float((share * (values.values[:, 0] - middle).square()).sum()) / prior.kernel.amplitude
     note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
         return PowerProcess(given(prior, values, seed), heard), (note,)

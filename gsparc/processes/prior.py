@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import Kernel, WaveKernel
-from gsparc.processes.sectors import SectorKernel, with_sectors
-from gsparc.processes.trend import Trend, trend_of
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.sectors import SectorKernel
+from gsparc.processes.term import restored, stored
+from gsparc.processes.trend import Trend
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Prior:
         trend: mean and columns of terms with unit normal weights; None: mean 0.
     """
 
-    kernel: Kernel | WaveKernel
+    kernel: Kernel
     trend: Trend | None = None
 
     def mean(self, places: Tensor) -> Tensor:
@@ -33,7 +34,7 @@ class Prior:
 
     def columns(self, places: Tensor) -> Tensor:
         """Return terms (n, Q) at places (n, D) [m]."""
-        return places.new_zeros(len(places), 0) if self.trend is None else self.trend.terms(places)
+        return places.new_zeros(len(places), 0) if self.trend is None else self.trend.columns(places)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
@@ -46,17 +47,14 @@ class Prior:
 
     def state(self) -> dict[str, Any]:
         """Return numbers that `read` needs."""
-        return {**self.kernel.state(), **({} if self.trend is None else self.trend.state())}
+        trend = {} if self.trend is None else {"trend": stored(self.trend)}
+        return {"kernel": self.kernel.state(), **trend}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Prior:
         """Return the prior whose `state()` this was."""
-        kinds: dict[str, Any] = {"wave": WaveKernel, "site_kernel": SectorKernel}  # the last as a kernel does
-        kind = next((kinds[name] for name in kinds if name in state), Kernel)
-        trend = trend_of(state) if "trend" in state else None
-        if trend is not None and "sectors" in state:
-            trend = with_sectors(trend, state["sectors"])
-        return cls(kind.read(state), trend)
+        kind: Any = SectorKernel if "site_kernel" in state["kernel"] else Kernel
+        return cls(kind.read(state["kernel"]), restored(state["trend"]) if "trend" in state else None)
 
 
 @dataclass(frozen=True)

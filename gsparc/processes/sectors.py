@@ -8,7 +8,7 @@ TR 36.814, table A.2.1.1-2:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -42,7 +42,7 @@ class Sectors(Trend):
         band: see `site`.
         shared: (6,) see `SHARED`.
         levels: (bands,) at the middle distance [dB].
-        doubt: (6 + bands, Q) what is uncertain of `columns`, for unit normal weights of a site.
+        doubt: (6 + bands, Q) what is uncertain of `shared_columns`, for unit normal weights of a site.
         unit: deviation of the processes [dB], in which terms are.
     """
 
@@ -65,7 +65,9 @@ class Sectors(Trend):
         """See `Trend`."""
         return self.at(places, self.shared, self.levels)
 
-    def at(self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None) -> Tensor:
+    def at(  # type: ignore[override]
+        self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
+    ) -> Tensor:
         """Return powers (..., n) [dB] for shared parameters (..., 6), levels; turn, tilt, width (..., 3)."""
         assert self.law is not None
         number = places[:, 6].long()
@@ -100,25 +102,20 @@ class Sectors(Trend):
         ends = self.at(places, self.shared + shared, self.levels, own)
         return ((ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)).T
 
-    def columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
+    def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         slopes = self.slopes(places) if slopes is None else slopes
         bands = self.which[1][places[:, 6].long()]
         return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
-    def terms(self, places: Tensor) -> Tensor:
+    def columns(self, places: Tensor) -> Tensor:
         """See `Trend`: each sector's azimuth, tilt, width and slope; what all share."""
         assert self.law is not None
         slopes, decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[3] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         own = (self.which[0][places[:, 6].long(), :, None] * parts[:, None]).flatten(1)
-        return torch.cat([own, self.columns(places, slopes) @ self.doubt], 1) / self.unit
-
-    def state(self) -> dict[str, Any]:
-        """See `Trend`."""
-        names = ("table", "site", "band", "shared", "levels", "doubt", "unit")
-        return {**super().state(), "sectors": {name: getattr(self, name) for name in names}}
+        return torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 
 @dataclass(frozen=True)
@@ -167,8 +164,3 @@ class SectorKernel:
         """Return the kernel whose `state()` this was."""
         v = tuple(float(value) for value in state["site_kernel"])
         return cls(v[:2], v[2:6], v[6], v[7])
-
-
-def with_sectors(trend: Trend, state: Mapping[str, Any]) -> Sectors:
-    """Return the trend whose `state()` had these sectors."""
-    return replace(Sectors(**{name: getattr(trend, name) for name in vars(trend)}), **state)

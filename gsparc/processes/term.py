@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from importlib.metadata import entry_points
 from typing import Any, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
 
+PLUGINS = "gsparc.terms"  # entry points of installed terms
+_KINDS: dict[str, type[Term[Any]]] = {}  # by the name that `stored` gives them
 Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
 
 
@@ -16,6 +20,10 @@ class Term(ABC, Generic[Rows]):
 
     Numbers of a term may be floats, or tensors with gradients where they are being learned.
     """
+
+    def __init_subclass__(cls, **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        _KINDS[cls.__name__] = cls
 
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:
@@ -37,6 +45,48 @@ class Term(ABC, Generic[Rows]):
         """Return the term with other parameters (p,), through which gradients flow."""
         return self
 
-    @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that make it again."""
+        """Return tensors and numbers that `read` needs: its attributes, where these are such."""
+        return dict(vars(self))
+
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Self:
+        """Return the term whose `state()` this was."""
+        return cls(**state)
+
+
+class Columns(Term[Tensor]):
+    """A term of places (n, D) [m] that is linear in weights of unit variance, times the prior's deviation."""
+
+    @abstractmethod
+    def columns(self, places: Tensor) -> Tensor:
+        """Return what each weight adds (n, Q) at places (n, D) [m], differentiable in these."""
+
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """See `Term`."""
+        return self.columns(a) @ self.columns(b).mT
+
+    def variance(self, a: Tensor) -> Tensor:
+        """See `Term`."""
+        return self.columns(a).square().sum(-1)
+
+
+def stored(term: Term[Any]) -> dict[str, Any]:
+    """Return what `restored` reads: the name of the term's class, and its state."""
+    return {"term": type(term).__name__, "state": term.state()}
+
+
+def restored(state: Mapping[str, Any]) -> Any:
+    """Return the term that `stored` wrote.
+
+    Raises:
+        ValueError: nothing that was imported defines a term of this name.
+    """
+    name = str(state["term"])
+    if name not in _KINDS:
+        for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
+            if point.attr == name:
+                point.load()
+    if name not in _KINDS:
+        raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
+    return _KINDS[name].read(state["state"])

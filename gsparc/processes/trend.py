@@ -6,11 +6,13 @@ The multi-wall model (COST Action 231, "Digital mobile radio towards future gene
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, Self
 
 import torch
 from torch import Tensor
+
+from gsparc.processes.term import Columns, restored, stored
 
 TINY_M = 1e-6  # distance that has a logarithm
 LEAST_SPREAD = 0.1  # decades: rows at nearly one distance say nothing of a slope that holds far away
@@ -50,26 +52,26 @@ class Law:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
         return self.level - 10 * self.exponent * self.decades(places)
 
-    def state(self) -> dict[str, list[float]]:
-        """Return numbers that `law_of_state` needs."""
-        return {"law": [*astuple(self)[:4]], "law_place": [*(self.place or ())]}
+    def state(self) -> dict[str, Any]:
+        """Return numbers that `read` needs."""
+        return {**vars(self), "place": [*(self.place or ())]}
 
-
-def law_of_state(state: dict[str, Any]) -> Law | None:
-    """Return the law whose `state()` this was; None of none."""
-    values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
-    at = (place[0], place[1], place[2]) if place else None
-    return Law(values[0], values[1], values[2], values[3], at) if values else None
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Self:
+        """Return the law whose `state()` this was."""
+        numbers = {name: float(state[name]) for name in ("level", "exponent", "floor", "scale")}
+        x = [float(value) for value in state["place"]]
+        return cls(**numbers, place=(x[0], x[1], x[2]) if x else None)
 
 
 @dataclass(frozen=True)
-class Walls:
-    """Q rectangles, boxes as six each.
+class Walls(Columns):
+    """Losses in Q rectangles, boxes as six each: one weight for walls, another for floors.
 
     >>> axes = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]])  # normal along x
     >>> corner, size = torch.tensor([[2.0, 0, 0]]), torch.tensor([[4.0, 3.0]])
     >>> wall = Walls(axes, corner, size, still=torch.tensor([0, 1.0, 1.0]))
-    >>> wall.crossed(torch.tensor([[5.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))  # behind the wall x = 2, and before it
+    >>> wall.columns(torch.tensor([[5.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))  # behind the wall x = 2, and before it
     tensor([[1., 0.],
             [0., 0.]])
 
@@ -85,7 +87,7 @@ class Walls:
     sizes: Tensor
     still: Tensor
 
-    def crossed(self, places: Tensor) -> Tensor:
+    def columns(self, places: Tensor) -> Tensor:
         """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6) [m]."""
         other = self.still.expand(len(places), 3) if len(self.still) else places[:, 3:]
         start, end = (
@@ -102,7 +104,7 @@ class Walls:
 
 
 @dataclass(frozen=True)
-class Trend:
+class Trend(Columns):
     """The mean of powers, and what of it is uncertain.
 
     >>> Trend(level=-70.0).mean(torch.zeros(2, 3))
@@ -113,14 +115,14 @@ class Trend:
         law: the distance law, or None.
         middle, spread: mean and deviation of the rows' decades of distance: over one deviation
             its uncertain slope changes powers as much as the process does.
-        walls: that are known; what one takes is uncertain, and what one floor takes.
+        more: further terms with uncertain weights, such as losses in known walls.
     """
 
     level: float
     law: Law | None = None
     middle: float = 0.0
     spread: float = 1.0
-    walls: Walls | None = None
+    more: tuple[Columns, ...] = ()
 
     @classmethod
     def about(cls, law: Law, places: Tensor) -> Trend:
@@ -132,23 +134,22 @@ class Trend:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
         return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
 
-    def terms(self, places: Tensor) -> Tensor:
-        """Return what is uncertain of the mean (n, P): constant, slope, losses in walls and floors."""
+    def columns(self, places: Tensor) -> Tensor:
+        """Return what is uncertain of the mean (n, Q): constant, slope, and what `more` terms have."""
         parts = [torch.ones_like(places[:, :1])]
         if self.law is not None:
             # Centred, so that slope and level are nearly independent.
             parts.append((self.law.decades(places)[:, None] - self.middle) / self.spread)
-        return torch.cat(parts if self.walls is None else [*parts, self.walls.crossed(places)], 1)
+        return torch.cat([*parts, *(term.columns(places) for term in self.more)], 1)
 
     def state(self) -> dict[str, Any]:
-        """Return numbers that `trend_of` needs."""
-        law = {"law": [], "law_place": []} if self.law is None else self.law.state()
-        walls = {} if self.walls is None else {"walls": vars(self.walls)}
-        return {"trend": [self.level, self.middle, self.spread], **law, **walls}
+        """See `Term`."""
+        law = None if self.law is None else self.law.state()
+        numbers = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {**numbers, "law": law, "more": [stored(term) for term in self.more]}
 
-
-def trend_of(state: dict[str, Any]) -> Trend:
-    """Return the trend whose `state()` this was."""
-    level, middle, spread = (float(v) for v in state["trend"])
-    walls = Walls(**state["walls"]) if "walls" in state else None
-    return Trend(level, law_of_state(state), middle, spread, walls)
+    @classmethod
+    def read(cls, state: dict[str, Any]) -> Self:
+        """See `Term`."""
+        law = None if state["law"] is None else Law.read(state["law"])
+        return cls(**{**state, "law": law, "more": tuple(restored(one) for one in state["more"])})

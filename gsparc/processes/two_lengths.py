@@ -11,7 +11,7 @@ import math
 import numpy as np
 import torch
 
-from gsparc.processes.density import by_evidence
+from gsparc.processes.density import Profiled, gram_of, learned
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.neighbourhood import covering
 
@@ -32,7 +32,8 @@ def first_kernel(length: float, spacing: float = 0.0) -> Kernel:
     >>> [round(length, 3) for length in first_kernel(0.1).lengths]
     [0.037, 0.28]
     """
-    return Kernel((START[0] * length, max(START[1] * length, SPANS * spacing)), (0.5, 0.5), 0.01)
+    lengths = START[0] * length, max(START[1] * length, SPANS * spacing)
+    return Kernel.matern(lengths, (0.5, 0.5), 0.01)
 
 
 def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
@@ -52,4 +53,6 @@ def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Ke
         *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
         (-LOGIT, LOGIT), (math.log(NOISES[0]), math.log(NOISES[1])),
     ]  # fmt: skip
-    return by_evidence(start, apart(at, at), real, bounds, LOOKS, SETTLED)
+    distance = apart(at, at)
+    evidence = lambda kernel: Profiled.apply(gram_of(kernel, distance), real)  # noqa: E731
+    return learned(evidence, [start], bounds, LOOKS, SETTLED)[1]

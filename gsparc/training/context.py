@@ -70,6 +70,7 @@ class FitContext:
         trainer: makes a Lightning Trainer from further options; None: as `gsparc.field.gradient_stage` does.
         callbacks: makes fresh Lightning callbacks.
         loggers: made once per run, closed by the caller.
+        terms: further terms of powers (`gsparc.processes.term.Columns`).
         config_yaml: the whole configuration, stored in every checkpoint.
 
     Raises:
@@ -93,6 +94,7 @@ class FitContext:
     trainer: partial[Any] | None = None
     callbacks: Callable[[], Sequence[Any]] = tuple
     loggers: Sequence[Any] = ()
+    terms: tuple[Any, ...] = ()
     config_yaml: str = ""
 
     def __post_init__(self) -> None:

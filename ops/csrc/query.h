@@ -55,7 +55,8 @@ template <class S> inline S distance(const S* a, const S* b, int axes) {
     return sqrt(squared);
 }
 
-// (share of Matern-5/2, its length), then the parts of Matern-3/2: distances (count,) in place to correlations, padded.
+// (share of Matern-5/2, its length), then the parts of Matern-3/2, or of Matern-1/2 where a length is negative: distances
+// (count,) in place to correlations, padded.
 template <class S> struct Correlation {
     S smooth, smooth_length, shares[2], lengths[2];
     int parts;
@@ -65,8 +66,9 @@ template <class S> struct Correlation {
             const Vec<S> far = load(values + i);
             Vec<S> sum = {};
             for (int part = 0; part < parts; ++part) {
-                const Vec<S> x = far * S(sqrt(3.0) / lengths[part]);
-                sum += shares[part] * ((S(1) + x) * exponential(-x));
+                const bool rough = lengths[part] < 0;
+                const Vec<S> x = far * S(rough ? -1.0 / lengths[part] : sqrt(3.0) / lengths[part]);
+                sum += shares[part] * ((S(1) + S(!rough) * x) * exponential(-x));
             }
             if (smooth > 0) {
                 const Vec<S> x = far * S(sqrt(5.0) / smooth_length);

@@ -8,7 +8,7 @@ from gsparc.ops import SphereGrid
 from gsparc.ops.queries import array_spectrum, nearest_weights, served
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.features import correlation, parts_of
-from gsparc.processes.kernel import Kernel
+from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
 from gsparc.processes.nearest import JITTER, weights_of
 
 
@@ -40,7 +40,10 @@ def test_spectra_of_an_array(grid, height, name):
 
 
 @pytest.mark.parametrize("near", [1, 5, 64])
-@pytest.mark.parametrize("kernel", [Kernel((0.3,), (1.0,), 0.1), Kernel((0.05, 2.0), (0.3, 0.7), 0.01)])
+@pytest.mark.parametrize("kernel", [
+    Kernel.of_one(0.3, 0.1), Kernel.matern((0.05, 2.0), (0.3, 0.7), 0.01),
+    Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7)), 0.01),
+])  # fmt: skip
 def test_weights_of_the_nearest_rows(near, kernel):
     torch.manual_seed(1)
     places, queries = torch.rand(200, 3, dtype=torch.float64), torch.rand(7, 3, dtype=torch.float64)
@@ -48,7 +51,7 @@ def test_weights_of_the_nearest_rows(near, kernel):
     noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
     rows = torch.cdist(queries, places).topk(near, largest=False).indices
     expected = weights_of(kernel, queries, places[rows], noise[rows])
-    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.lengths, kernel.shares)
+    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled, kernel.shares)
     assert found is not None
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, atol=1e-10, rtol=1e-9)

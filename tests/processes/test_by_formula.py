@@ -8,7 +8,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import EXCESS, Sample, density_given_nearest
 from gsparc.processes.powers import averaged
 
-KERNEL = Kernel((1.2, 6.0), (0.4, 0.6), 0.08)
+KERNEL = Kernel.matern((1.2, 6.0), (0.4, 0.6), 0.08)
 
 
 def test_variance_of_places_is_what_known_ones_leave():
@@ -35,10 +35,10 @@ def test_density_of_rows_given_their_neighbours():
     excess = max(np.log(amplitude / np.mean(values[:, 0] ** 2)), 0)
     wanted = 0.5 * (np.log(amplitude) + np.mean(np.log(variance))) + EXCESS * excess**2 / 12
     sample = Sample.of(*map(torch.from_numpy, (places, values, count)))
-    parameters = torch.from_numpy(KERNEL.parameters()).requires_grad_()
-    nats, found = density_given_nearest(parameters, sample)
+    parameters = KERNEL.parameters().requires_grad_()
+    nats, found = density_given_nearest(KERNEL.at(parameters), sample)
     assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6
-    assert torch.autograd.gradcheck(lambda at: density_given_nearest(at, sample)[0], parameters)
+    assert torch.autograd.gradcheck(lambda at: density_given_nearest(KERNEL.at(at), sample)[0], parameters)
 
 
 def test_variance_of_a_mixture_has_what_its_members_disagree_about():

@@ -8,7 +8,7 @@ from gsparc.processes.density import LeftOutDensity, gram_of, walked
 from gsparc.processes.factor import NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel
 
-KERNELS = (Kernel((0.3,), (1.0,), 0.1), Kernel((0.1, 0.5), (0.3, 0.7), 0.1))
+KERNELS = (Kernel.matern((0.3,), (1.0,), 0.1), Kernel.matern((0.1, 0.5), (0.3, 0.7), 0.1))
 
 
 def rows(count: int, outputs: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -26,9 +26,10 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
     distance, columns, values = rows(40, outputs)
 
     def density(at: torch.Tensor) -> torch.Tensor:
-        return LeftOutDensity.apply(gram_of(at, distance, columns), values, outputs + 1, bounded)[0]
+        gram = gram_of(kernel.at(at), distance, columns)
+        return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
 
-    at = torch.from_numpy(kernel.parameters()).requires_grad_()
+    at = kernel.parameters().requires_grad_()
     (slope,) = torch.autograd.grad(density(at), at)
     for axis in torch.eye(len(at), dtype=torch.float64):
         ends = [float(density(at.detach() + h * axis)) for h in (-1e-5, 1e-5)]
@@ -37,7 +38,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
 
 def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
     distance, columns, values = rows(12, 3)
-    gram = gram_of(torch.from_numpy(KERNELS[1].parameters()), distance, columns)
+    gram = gram_of(KERNELS[1], distance, columns)
     density, amplitude = (float(part) for part in LeftOutDensity.apply(gram, values, 3, False))
     total, g, y = 0.0, gram.numpy(), values.numpy()
     for i in range(12):
@@ -51,7 +52,7 @@ def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
 
 def test_kernels_are_their_parameters():
     for kernel in KERNELS:
-        again = Kernel.of(kernel.parameters(), kernel.amplitude)
+        again = kernel.at(kernel.parameters())
         numbers = [*again.lengths, *again.shares, again.noise]
         assert np.allclose(numbers, [*kernel.lengths, *kernel.shares, kernel.noise])
 

@@ -25,7 +25,7 @@ from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
 from tests.models.powers.test_settings import error_db, fit, town
 
-KERNEL = Kernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
+KERNEL = Kernel.matern((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 
 def rows_of(data, count: int) -> Rows:
@@ -51,7 +51,7 @@ def many(monkeypatch):
 def test_given_all_rows_as_neighbours_it_is_the_exact_process():
     data = town(140)
     rows = rows_of(data, 120)
-    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
     near = given(rows, 1000)
     queries = torch.from_numpy(np.concatenate([data.moving[120:], data.moving[120:] + 3000.0]))
     for one, other in zip(near.answer(queries), whole.answer(queries), strict=True):
@@ -71,7 +71,7 @@ def test_rows_of_one_place_are_its_mean_and_lose_nothing():
     often = np.repeat(np.arange(40), 3)
     rows = rows_of(data, 60).at(often)
     rows = Rows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
-    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
     near = given(rows, 1000)
     assert len(near.places) == 40
     for one, other in zip(
@@ -97,7 +97,7 @@ def test_silent_rows_stay_known_and_are_counted(many):
     level = float(np.quantile(data.target, 0.3))
     silent = data.target[:, 0] < level
     rows = Rows(data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent)
-    process, notes = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    process, notes = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
     assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), notes
     loud = rows.at(np.flatnonzero(~silent))
     deaf = given(loud)
@@ -136,7 +136,7 @@ def test_left_out_is_a_prediction_without_each_place():
     data = town(50)
     rows = rows_of(data, 50)
     near = given(rows, 1000)
-    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
     exactly, spread = (part.numpy() for part in whole.posterior.left_out())
     mean, variance = (part.numpy() for part in near.posterior.left_out())
     order = np.lexsort(rows.places.T[::-1])  # as unique places come
@@ -148,7 +148,7 @@ def test_left_out_is_a_prediction_without_each_place():
 def test_covariances_are_those_of_rows_that_cover_the_site(many):
     data = town(400)
     rows = rows_of(data, 300)
-    process, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    process, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
     few = process.exact()
     assert len(few.places) == 100 and few.exact() == few and isinstance(few.posterior, Exact)
     queries = torch.from_numpy(data.moving[300:])
@@ -215,7 +215,7 @@ def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
 def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
     rng = np.random.default_rng(0)
     places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
-    prior = Prior(SmoothRough.of_one(0.5, 0.1))
+    prior = Prior(Kernel.of_one(0.5, 0.1, term=SmoothRough))
     queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
     near = given_places(prior, Values.of(places, values), 0, most=40).answer(queries)
     exact = Exact.of(prior, torch.from_numpy(places), values).answer(queries)

@@ -1,5 +1,7 @@
 """Posteriors against an independent library, and complex ones against twice as many real numbers."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import Kernel, WaveKernel
+from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
@@ -22,7 +24,7 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     lengths, noise, level = rng.uniform(0.1, 3, 2), 10 ** rng.uniform(-3, 0), rng.normal()
     places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
     values = rng.normal(size=(count, outputs))
-    kernel = Kernel(tuple(lengths), (share, 1 - share), noise)
+    kernel = Kernel.matern(tuple(lengths), (share, 1 - share), noise)
     posterior = Exact.of(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
     found = posterior.answer(torch.from_numpy(queries))
     shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5)
@@ -36,12 +38,48 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     np.testing.assert_allclose(posterior.values(), values, atol=1e-8)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_sums_of_terms_are_gpytorchs(seed):
+    """Mean, variance and density of short and exponential shadowing with an uncertain level, all weighed."""
+    gpytorch = pytest.importorskip("gpytorch", reason="GPyTorch is not installed, of the extra `dev`")
+    draw = torch.Generator().manual_seed(seed)
+    share, short, long, noise, amplitude = (0.05 + 0.9 * torch.rand(5, generator=draw)).tolist()
+    places, queries = (3 * torch.rand(n, 2, generator=draw, dtype=torch.float64) for n in (30, 6))
+    values = torch.randn(30, generator=draw, dtype=torch.float64)
+    terms = Shadowing(short, share), ExponentialShadowing(long, 1 - share)
+    ours = Exact.of(Prior(Kernel(terms, noise, amplitude), Trend(0.0)), places, values[:, None])
+
+    parts, kernels = [], gpytorch.kernels
+    for kernel, weight in (
+        (kernels.MaternKernel(1.5), share),
+        (kernels.MaternKernel(0.5), 1 - share),
+        (kernels.ConstantKernel(), 1.0),
+    ):
+        parts.append(kernels.ScaleKernel(kernel).double())
+        parts[-1].outputscale = amplitude * weight
+    parts[0].base_kernel.lengthscale, parts[1].base_kernel.lengthscale = short, long
+    parts[2].base_kernel.constant = torch.ones(1, dtype=torch.float64)
+    likelihood = gpytorch.likelihoods.GaussianLikelihood().double()
+    likelihood.noise = amplitude * noise
+    theirs = gpytorch.models.ExactGP(places, values, likelihood)
+    normal = gpytorch.distributions.MultivariateNormal
+    theirs.forward = lambda at: normal(at.new_zeros(len(at)), (parts[0] + parts[1] + parts[2])(at))
+    off = gpytorch.settings.fast_computations(False, False, False)
+    with torch.no_grad(), off:
+        nats = likelihood(theirs.train()(places)).log_prob(values)
+        said, found = likelihood(theirs.eval()(queries)), ours.answer(queries)
+    told = Conditioned(ours.factor, values[:, None] / amplitude**0.5, ours.weights / amplitude**0.5)
+    torch.testing.assert_close(found.mean[:, 0], said.mean)
+    torch.testing.assert_close(amplitude * found.left, said.variance)
+    assert -told.nll - 15 * math.log(2 * math.pi * amplitude) == pytest.approx(float(nats))
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     generator = torch.Generator().manual_seed(seed)
     places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
-    prior = Prior(WaveKernel(20.0, 0.7, 0.05))
+    prior = Prior(Kernel((IsotropicWaves(0.7, 1.0, 20.0),), 0.05))
     both = Exact.of(prior, places, values)
     pairs = Exact.of(prior, places, torch.cat([values.real, values.imag], 1))
     queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
@@ -75,7 +113,7 @@ def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
     """Within 2 % at places among the rows and far from all; means are the exact ones."""
     rng = np.random.default_rng(0)
     places = torch.from_numpy(np.c_[rng.uniform(0, 10, (1_500, 2)), np.zeros(1_500)])
-    kernel = Kernel((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
+    kernel = Kernel.matern((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
     values = -60 + 3 * torch.sin(places[:, :1]) + torch.from_numpy(rng.normal(size=(1_500, 1)))
     many = Exact.of(Prior(kernel, trend), places, values)
     inside = torch.from_numpy(np.c_[rng.uniform(0, 10, (200, 2)), np.zeros(200)])

@@ -50,7 +50,7 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
         return level({name: float(spread) / 2}) - level({name: -float(spread) / 2})
 
     np.testing.assert_allclose(trend.mean(places), level({}), atol=1e-5)
-    columns, terms = trend.columns(places).numpy(), trend.terms(places).numpy()
+    columns, terms = trend.shared_columns(places).numpy(), trend.columns(places).numpy()
     np.testing.assert_allclose(columns[:, 0], slope("exponent", SHARED_SPREAD[0]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 5], slope("tilt", SHARED_SPREAD[5]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 6:], LEVEL_DB * np.eye(2)[number])

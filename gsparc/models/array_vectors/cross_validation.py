@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from gsparc.models.array_vectors.vector_gp import align, refine_alignment
 from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import SmoothRough
+from gsparc.processes.kernel import Kernel, SmoothRough
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
@@ -38,7 +38,7 @@ class Tuned:
         left_out: the held-out predictions; None for too few samples.
     """
 
-    kernel: SmoothRough
+    kernel: Kernel
     unknown: np.ndarray
     error: np.ndarray
     left_out: LeftOut | None = None
@@ -76,11 +76,11 @@ def tune(
     )
     aligned = align(vectors, positions, partner)
 
-    def kernel_at(parameters: np.ndarray) -> SmoothRough:
+    def kernel_at(parameters: np.ndarray) -> Kernel:
         length, noise = np.exp(np.clip(parameters, np.log([0.02, 1e-4]), np.log([5.0, 1.0])))
-        return SmoothRough.of_one(float(length * wavelength), float(noise))
+        return Kernel.of_one(float(length * wavelength), float(noise), term=SmoothRough)
 
-    def inverse_of(kernel: SmoothRough) -> np.ndarray:
+    def inverse_of(kernel: Kernel) -> np.ndarray:
         return Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
 
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
@@ -119,7 +119,7 @@ class _Samples:
     distance: np.ndarray
 
     def predictions(
-        self, kernel: SmoothRough, inverse: np.ndarray, vectors: np.ndarray
+        self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
         mean, variance = predict_left_out(inverse, vectors, self.distance, self.centres, self.gaps)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import SmoothRough
+from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import solved
 
 SWEEPS = 30
@@ -127,7 +127,7 @@ def refine_alignment(
 
 
 def aligned_by(
-    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: SmoothRough
+    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
 ) -> np.ndarray:
     """Vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
 
@@ -143,7 +143,7 @@ def aligned_by(
 
 def aligned_to(
     vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
-    partner: np.ndarray | None, kernel: SmoothRough,
+    partner: np.ndarray | None, kernel: Kernel,
 ) -> np.ndarray:  # fmt: skip
     """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
 

@@ -25,7 +25,7 @@ from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
 from gsparc.processes.powers import Rows
-from gsparc.processes.trend import TINY_M, Law, law_of_state
+from gsparc.processes.trend import TINY_M, Law
 from gsparc.processes.worker import stop_when_late
 from gsparc.training.time_budget import TimeBudget
 
@@ -217,6 +217,4 @@ class DistanceLaw(Differentiable):
         return self.law.state()
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        result = law_of_state(state)
-        assert result is not None
-        self.law = result
+        self.law = Law.read(state)

@@ -25,9 +25,9 @@ from gsparc.models.reduced import Filled, MeanOnly, View
 from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.nearest import Nearest, Sample, Values, given, most_likely
+from gsparc.processes.nearest import Sample, Values, given, most_likely
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 
@@ -185,7 +185,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is None:
             return None
         result = copy.copy(self)
-        result.powers, _ = conditioned(rows_of(data, rows), self.powers.trend, self.powers.kernel, 0)
+        result.powers, _ = conditioned(rows_of(data, rows), self.powers.posterior.prior, 0)
         return result
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
@@ -258,7 +258,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             self.powers = PowerProcess.read(state["powers"])
             return
         super()._relearn(state)
-        self.scores = (Nearest if "level" in state["scores"] else Exact).read(state["scores"])
+        self.scores = posterior_of(state["scores"])
 
 
 def projected(

@@ -28,10 +28,10 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import Kernel, WaveKernel
-from gsparc.processes.nearest import Nearest, Values, given, solved
+from gsparc.processes.kernel import IsotropicWaves, Kernel
+from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
-from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
 from gsparc.processes.prior import Prior
 from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.training.context import FitContext, FitReport
@@ -69,7 +69,7 @@ class ComplexGP(ClosedForm):
         return approximated(self.name, self.posterior)
 
     @property
-    def kernel(self) -> WaveKernel | Kernel:
+    def kernel(self) -> Kernel:
         """Its length, noise and power."""
         return self._fitted().prior.kernel
 
@@ -87,7 +87,7 @@ class ComplexGP(ClosedForm):
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
-    def _kernels(self, places: Tensor, values: Tensor) -> Iterator[WaveKernel | Kernel]:
+    def _kernels(self, places: Tensor, values: Tensor) -> Iterator[Kernel]:
         """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""
         assert self.site is not None and self.site.wavelength is not None
         if self.site.phase_reference == "neighbours":
@@ -99,7 +99,8 @@ class ComplexGP(ClosedForm):
             return
         for length in LENGTHS:
             for noise in NOISES:
-                yield WaveKernel(2 * math.pi / self.site.wavelength, length * self.site.wavelength, noise)
+                wavenumber = 2 * math.pi / self.site.wavelength
+                yield Kernel((IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber),), noise)
 
     def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
@@ -189,7 +190,7 @@ class ComplexGP(ClosedForm):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.posterior = (Nearest if "level" in state["posterior"] else Exact).read(state["posterior"])
+        self.posterior = posterior_of(state["posterior"])
         self.runs = RunFactors.read(state)
 
     def size(self) -> int:
@@ -197,18 +198,14 @@ class ComplexGP(ClosedForm):
         return 0 if self.posterior is None else len(self.posterior.places)
 
 
-def _aligned(
-    kernel: WaveKernel | Kernel, rows: Group, runs: int
-) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
+def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """See `columns.aligned`; of a kernel of unit power."""
     gram = kernel.between(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
     return aligned((rows,), [gram], runs)
 
 
-def _density(
-    kernel: WaveKernel | Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor
-) -> float:
+def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
     """Negative log density of rows given their neighbours at the best power, visits to one place included.
 
     Args:

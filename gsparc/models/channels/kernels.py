@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsparc.ops.transforms import beyond_kernels
 from gsparc.physics.waves import NEAR_M
-from gsparc.processes.kernel import WaveKernel, matern32_of_squares
+from gsparc.processes.kernel import IsotropicWaves, matern32_of_squares
 
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
 
@@ -64,7 +64,7 @@ def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Te
     Args:
         a, b: (..., n, 3) and (..., m, 3) [m] of one end, or (..., 6) of both.
     """
-    return WaveKernel(wavenumber, length).between(a, b)
+    return IsotropicWaves(length, wavenumber=wavenumber).covariance(a, b)
 
 
 def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContex
         DataError: `init=scene` without a file, or walls that cannot be.
     """
     walls = read_walls(init.file) if init.name == "scene" else None
-    return PowerField(init.name != "diffuse", context.seed, walls)
+    return PowerField(init.name != "diffuse", context.seed, walls, context.terms)
 
 
 def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:

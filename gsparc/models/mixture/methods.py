@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
 
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate
 from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.powers.own_terms import columns_of
 from gsparc.models.terms import no_array, no_phase
+from gsparc.training.context import FitContext, FitReport
 
 PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
@@ -48,10 +53,25 @@ class Channels(Mixture):
 
 
 class Powers(Mixture):
-    """A process of decibels about a distance law; of several stations, about a law of the site."""
+    """A process of decibels about a distance law; of several stations, about a law of the site.
+
+    Args:
+        *settings: of `Mixture`.
+        terms: further terms of one station's powers, see `columns_of`.
+        **named: see `settings`.
+    """
 
     name = "powers"
     uses_censored = True
+    stored_names: ClassVar[dict[str, str]] = {**Mixture.stored_names, "terms": ""}
+
+    def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named: Any) -> None:
+        super().__init__(*settings, **named)
+        self.own_terms = tuple(columns_of(one) for one in terms)
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """See `Mixture`, with terms of the user's own."""
+        return super().fit(data, fold, replace(context, terms=self.own_terms))
 
     def tries(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
@@ -62,6 +82,8 @@ class Powers(Mixture):
 
     def obstacle(self, data: Measurements) -> str | None:
         """See `Mixture`."""
+        if self.own_terms and data.site.stations is not None and len(data.site.stations) > 1:
+            return "model.terms are of one station's model; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 
 

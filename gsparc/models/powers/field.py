@@ -8,7 +8,6 @@ process.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -26,15 +25,16 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
+from gsparc.models.powers.own_terms import InWorld
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
-from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximated
-from gsparc.processes.powers import PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
-from gsparc.processes.trend import Trend, trend_of
+from gsparc.processes.term import Columns
+from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -48,17 +48,19 @@ class PowerField(ClosedForm):
         waves: whether coherent ones are sought where neighbours are closer than half a wavelength.
         seed: of rows and waves that are drawn.
         walls: that are known, in the coordinates of the measurements; no waves are sought beside them.
+        terms: further columns of the mean, in the coordinates of the measurements.
     """
 
     name = "process of powers"
     site: Site
-    trend: Trend  # the mean law
-    kernel: Kernel
+    priors: tuple[tuple[float, Prior], ...]  # with shares of the mean, the largest first
 
-    def __init__(self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None) -> None:
-        self.waves, self.seed, self.walls = waves, seed, walls
+    def __init__(
+        self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None,
+        terms: tuple[Columns, ...] = (),
+    ) -> None:  # fmt: skip
+        self.waves, self.seed, self.walls, self.own_terms = waves, seed, walls, terms
         self.fringes: Fringes | None = None  # of coherent waves, beside the process
-        self.others: tuple[tuple[float, Prior], ...] = ()  # with shares of the mean, beside trend and kernel
         self.powers: PowerProcess | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
@@ -66,10 +68,10 @@ class PowerField(ClosedForm):
         self.decibels = np.zeros(0)
 
     @classmethod
-    def of(cls, site: Site, trend: Trend, kernel: Kernel) -> PowerField:
+    def of(cls, site: Site, prior: Prior) -> PowerField:
         """One of known settings, to be conditioned."""
         result = cls()
-        result.site, result.trend, result.kernel = site, trend, kernel
+        result.site, result.priors = site, ((1.0, prior),)
         return result
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -81,37 +83,42 @@ class PowerField(ClosedForm):
         budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
-        self.site, self.fringes, self.others = data.site, None, ()
+        self.site, self.fringes = data.site, None
         notes = self._choose(data, rows, budget)
         self.condition(data, rows)
         return FitReport(budget.counted.wall, notes, budget.limited_by)
 
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
-        """Set the law, the kernel, waves and further priors; what must be said of them."""
+        """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
+        more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
         if self.walls is not None:
             walls = counted(self.walls, site.origin, site.static_position)
             law, notes = law_of(seen, site)
-            self.trend = replace(trend_of_rows(seen, law), walls=walls)
-            best = chosen_among(seen, [(self.trend, 0.0, ())], self.seed, chosen_on)
-            self.kernel = best.kernel
+            trend = replace(trend_of_rows(seen, law), more=(walls, *more))
+            best = chosen_among(seen, [(trend, 0.0, ())], self.seed, chosen_on)
+            self.priors = ((1.0, best.prior),)
             note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
             return (note, *notes, *best.notes)
-        found, said = candidates(seen, site, self.seed, chosen_on), list[str]()
-        self.trend, self.kernel = plain = found[0].trend, found[0].kernel
+        found, said = candidates(seen, site, self.seed, chosen_on, more), list[str]()
+        self.priors = ((1.0, found[0].prior),)
         if self.waves and not seen.silent.any() and sampled(seen.places, site.wavelength):
             order = np.argsort(rows)
             assert site.wavelength is not None
             self.fringes, note = find_fringes(
-                seen.at(order), rows[order], plain, site.wavelength, self.seed, budget
+                seen.at(order), rows[order], found[0].prior, site.wavelength, self.seed, budget
             )
             said.append(note)
             if self.fringes is not None:  # their share was learned beside this process
                 return (found[0].description, *found[0].notes, note)
-        ((_, first), *others), notes = mixture(seen, found, self.seed, chosen_on)
-        assert isinstance(first.kernel, Kernel) and first.trend is not None
-        self.trend, self.kernel, self.others = first.trend, first.kernel, tuple(others)
+        self.priors, notes = mixture(seen, found, self.seed, chosen_on)
         return (*notes, *said)
+
+    @property
+    def trend(self) -> Trend:
+        """The mean law of the first prior."""
+        assert self.priors[0][1].trend is not None
+        return self.priors[0][1].trend
 
     @property
     def label(self) -> str:
@@ -134,16 +141,14 @@ class PowerField(ClosedForm):
     @property
     def terms(self) -> tuple[str, ...]:
         """`power` where walls are known, `phase` where coherent waves are, `residual` always."""
-        named = {"power": self.trend.walls is not None, "phase": self.fringes is not None, "residual": True}
+        named = {"power": bool(self.trend.more), "phase": self.fringes is not None, "residual": True}
         return tuple(name for name, there in named.items() if there)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
         seen = rows_of(data, rows)
-        first = Prior(self.kernel, self.trend)
-        own, *others = (_given(seen, prior, self.seed) for prior in (first, *(one for _, one in self.others)))
-        shares = (share for share, _ in self.others)
-        self.powers = replace(own, others=tuple(zip(shares, others, strict=True)))
+        own, *others = ((share, conditioned(seen, prior, self.seed)[0]) for share, prior in self.priors)
+        self.powers = replace(own[1], others=tuple(others))
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
@@ -191,31 +196,21 @@ class PowerField(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        lengths, shares, kernel = (torch.tensor(part).double() for part in self.kernel.state().values())
-        logit = (shares[0] / shares[1]).log() if len(shares) == 2 else torch.zeros(()).double()
         return {
-            "log_lengths": lengths.log(),
-            "share_logit": logit,
-            "log_noise": kernel[0].log(),
-            "log_amplitude": kernel[1].log(),
-            **self.trend.state(),
+            "priors": [{**prior.state(), "share": share} for share, prior in self.priors],
             "seed": self.seed,
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
-            "others": [{**prior.state(), "share": share} for share, prior in self.others],
             **({} if self.fringes is None else {"fringes": self.fringes.state()}),
             **({} if self.powers is None else {"process": self.powers.state()}),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        logit = [state["share_logit"][None]] if len(state["log_lengths"]) == 2 else []
-        settings = torch.cat([state["log_lengths"], *logit, state["log_noise"][None]]).double()
-        self.kernel = Kernel.of(settings.numpy(), math.exp(state["log_amplitude"]))
-        self.site, self.trend, self.seed = site, trend_of(state), int(state["seed"])
+        self.site, self.seed = site, int(state["seed"])
+        self.priors = tuple((float(one["share"]), Prior.read(one)) for one in state["priors"])
         self.fringes = fringes_of(state["fringes"]) if "fringes" in state else None
-        self.others = tuple((float(one["share"]), Prior.read(one)) for one in state.get("others", ()))
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
         self.powers = PowerProcess.read(state["process"]) if "process" in state else None
 
@@ -240,8 +235,3 @@ class PowerField(ClosedForm):
 
     def _power(self, decibels: Tensor) -> Tensor:
         return from_real(decibels[:, None], "rssi", (1,))
-
-
-def _given(rows: Rows, prior: Prior, seed: int) -> PowerProcess:
-    assert isinstance(prior.kernel, Kernel) and prior.trend is not None
-    return conditioned(rows, prior.trend, prior.kernel, seed)[0]

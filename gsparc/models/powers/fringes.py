@@ -20,11 +20,10 @@ from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
-from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out, left_out_group
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
-from gsparc.processes.trend import Trend
+from gsparc.processes.prior import Prior
 from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5
@@ -162,7 +161,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: tuple[Trend, Kernel],
+    plain: Prior,
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -172,7 +171,7 @@ def find_fringes(
     Args:
         rows: all heard.
         numbers: (n,) of the rows, sorted.
-        plain: the process's mean law and kernel.
+        plain: of the process.
         wavelength: [m].
         seed: of starts, folds and rows that are drawn.
         budget: how many are sought, and when none is any longer.
@@ -191,7 +190,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process = conditioned(rows, *plain, seed)[0].exact()
+    error, distance = _apart(rows, fold, conditioned(rows, plain, seed)[0].exact())
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
@@ -200,7 +199,7 @@ def find_fringes(
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))
         powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
-        blend, gain = _blend(rows, group, fold, powers, blind, process)
+        blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
@@ -230,15 +229,8 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     return spread * (1 / number - 1 / every)
 
 
-def _blend(
-    rows: Rows,
-    group: np.ndarray,
-    fold: np.ndarray,
-    powers: np.ndarray,
-    blind: np.ndarray,
-    process: PowerProcess,
-) -> tuple[Blend, Gain]:
-    """How to share predictions with a process, and what that gains at places left out."""
+def _apart(rows: Rows, fold: np.ndarray, process: PowerProcess) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n,) of a process without a row, or its fold, and distances (n,) to what is left [m]."""
     exact = process.posterior
     assert isinstance(exact, Exact)
     inverse, weights = exact.factor.inverse, exact.weights[:, :1]
@@ -249,6 +241,15 @@ def _blend(
         part, rest = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
         error[part] = -left_out_group(inverse, weights, torch.from_numpy(part))[0][:, 0].numpy()
         distance[part] = cKDTree(rows.places[rest]).query(rows.places[part])[0]
+    return error, distance
+
+
+def _blend(
+    rows: Rows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
+    error: np.ndarray, distance: np.ndarray,
+) -> tuple[Blend, Gain]:  # fmt: skip
+    """How to share predictions with a process of errors (n,), and what that gains at places left out."""
+    probes = fold < 0
     towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
     excess = _excess_variance(powers, fold, blind)
     shares, left = [], []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,16 +18,18 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SPREAD, groups
 from gsparc.processes.censored import ConditionalGaussian, Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart, bounds_of
+from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, settings_of
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
 from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import late
 from gsparc.training.time_budget import Effort
@@ -35,7 +38,7 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON, LEAST_COMPARED_ON = 500, 150  # of them, constant and distance law; with little effort
+COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
@@ -46,8 +49,9 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
-LOOKS, SETTLED = 40, 5e-6
+LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
+LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
@@ -65,17 +69,9 @@ def fit_powers(
         seed: of the rows that are drawn where there are too many.
         chosen_on: rows that settings are chosen on, of more.
     """
-    trend, kernel, notes = choose_prior(rows, site, mean, seed, chosen_on)
-    process, more = conditioned(rows, trend, kernel, seed)
-    return process, (*notes, *more)
-
-
-def choose_prior(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
-) -> tuple[Trend, Kernel, tuple[str, ...]]:
-    """The settings of `fit_powers` alone, and what must be said of them."""
     best = chosen_among(rows, _trends(rows, site, mean), seed, chosen_on)
-    return best.trend, best.kernel, (best.description, *best.notes)
+    process, more = conditioned(rows, best.prior, seed)
+    return process, (best.description, *best.notes, *more)
 
 
 @dataclass(frozen=True)
@@ -89,6 +85,11 @@ class Candidate:
     notes: tuple[str, ...] = ()
 
     @property
+    def prior(self) -> Prior:
+        """Both."""
+        return Prior(self.kernel, self.trend)
+
+    @property
     def description(self) -> str:
         """One line of the settings."""
         parts = [f"{length:.4g} m" for length in self.kernel.lengths]
@@ -97,40 +98,66 @@ class Candidate:
         law, noise = self.trend.law, f"noise {self.kernel.noise:.3g} of the signal's variance"
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
         word = "length" if len(parts) == 1 else "lengths"
+        word = f"exponential {word}" if isinstance(self.kernel.terms[0], ExponentialShadowing) else word
         return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
 
 
-def candidates(rows: Rows, site: Site, seed: int, chosen_on: int) -> list[Candidate]:
-    """Of each mean law the settings of `choose_prior`, the best first; of few or very many rows the best."""
-    trends = _trends(rows, site, "auto")
+def candidates(
+    rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
+) -> list[Candidate]:
+    """Of each mean law the likeliest settings, the best first, then those of kriging.
+
+    Of few or very many rows the best law alone. Each law has further `terms`.
+    """
+    laws = _trends(rows, site, "auto")
+    trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
-    found = [chosen_among(rows, [one], seed, chosen_on) for one in trends]
-    return sorted(found, key=lambda one: -one.score)
+    found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
+    return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
+
+
+def _kriged(rows: Rows, trend: Trend) -> Candidate:
+    """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
+    found = fit_variogram(rows.places, _views(rows, trend)[2].numpy())
+    sill = max(found.sill, LEAST_SILL * found.total)
+    kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
+    return Candidate(-math.inf, trend, kernel, 0.0)
 
 
 def mixture(
     rows: Rows, found: list[Candidate], seed: int, chosen_on: int
-) -> tuple[list[tuple[float, Prior]], tuple[str, ...]]:
+) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Candidates with their shares in a mean, the largest first, and what must be said of them.
 
-    Shares have the least squared error at squares of floor left out, with a prior on equal ones.
+    Shares of two have the least squared error at squares of floor left out, with a prior on equal ones.
     """
     if len(found) == 1:
-        return [(1.0, Prior(found[0].kernel, found[0].trend))], (found[0].description, *found[0].notes)
+        return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
     part = rows.drawn(chosen_on, seed)
-    posteriors = [conditioned(part, one.trend, one.kernel, seed)[0].posterior for one in found]
+    posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
     gram, count = np.zeros((len(found),) * 2), 0.0
     for sides in SIDES:
         errors = np.stack([_left_out(one, sides) for one in posteriors])
         gram += errors @ errors.T / errors.shape[1] / len(SIDES)
         count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
-    share = best_weights(gram + gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found)))
+    gram += gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found))
+    share = _shares_of_two(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
     notes = dict.fromkeys(note for _, one in kept for note in one.notes)
-    return [(weight, Prior(one.kernel, one.trend)) for weight, one in kept], (*said, *notes)
+    return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
+
+
+def _shares_of_two(gram: np.ndarray) -> np.ndarray:
+    """Shares (K,) of the best two, by products (K, K) of errors: each further one is as many more queries."""
+    tried = []
+    for pair in combinations(range(len(gram)), 2):
+        share = np.zeros(len(gram))
+        share[list(pair)] = best_weights(gram[np.ix_(pair, pair)])
+        tried.append(share)
+    return min(tried, key=lambda share: float(share @ gram @ share))
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
@@ -150,7 +177,7 @@ def chosen_among(
     if not many:
         return best
     values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
-    kernel, how = settings_of(Prior(best.kernel, best.trend), values, seed)
+    kernel, how = settings_of(best.prior, values, seed)
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
@@ -160,8 +187,7 @@ def _settings(
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows if rows.silent.all() else rows.loud
     loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on, seed))
-    compared_on = min(COMPARED_ON, max(chosen_on // 2, LEAST_COMPARED_ON))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), compared_on, seed))
+    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
     weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
@@ -170,10 +196,11 @@ def _settings(
         weighed = _in_doubt(weighed, candidates[-1])
         scores = [_weighed(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
-    if len(loud.places) > len(few.places) and not late():
-        best = _searched(loud, best, [best.kernel])
     if len(loud.places) >= TWO_LENGTHS_NEED and not late():
-        best = max(best, _searched(loud, best, _pairs(loud, best.kernel), 2.0), key=lambda one: one.score)
+        best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
+    if len(loud.places) > len(few.places) and not late():
+        # A look at all rows costs several at few: what was found on these is near already.
+        best = _searched(loud, best, [best.kernel], looks=REFINED)
     if both and not late():  # one walk: each look factors several covariances
         best = _weighed(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
@@ -203,14 +230,13 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (n, n) [m], terms (n, P) and values less the mean (n, 1) [dB]."""
     places = torch.from_numpy(rows.places)
     values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.terms(places), values[:, None]
+    return apart(places, places), trend.columns(places), values[:, None]
 
 
 def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
+    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
 ) -> tuple[float, Kernel]:
-    bounds = bounds_of(len(starts[0].lengths), distance.numpy())
-    return by_left_out(starts, distance, terms, values, bounds, LOOKS, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
@@ -224,23 +250,25 @@ def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _searched(rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0) -> Candidate:
+def _searched(
+    rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
+) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = _by_left_out(starts, *_views(rows, one.trend))
+    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
 def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
     scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [Kernel((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
-    return near + [Kernel((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+    near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
+    return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
 def _in_doubt(rows: Rows, one: Candidate) -> Rows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
     distance, terms, values = _views(rows, one.trend)
-    gram = one.kernel.amplitude * gram_of(torch.from_numpy(one.kernel.parameters()), distance, terms)
+    gram = one.kernel.amplitude * gram_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
     known = ConditionalGaussian.of(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.doubt(values[silent, 0])
@@ -254,18 +282,18 @@ def _weighed(rows: Rows, one: Candidate, looks: int) -> Candidate:
     distance, terms, values = _views(rows, one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
-    bounds = bounds_of(len(one.kernel.lengths), distance.numpy())
+    bounds = one.kernel.bounds(distance)
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
     last: list[Sites] = []
 
     def objective(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * gram_of(at[:-1], distance, terms)
+        gram = at[-1].exp() * gram_of(one.kernel.at(at[:-1]), distance, terms)
         return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
-    start = np.append(one.kernel.parameters(), math.log(one.kernel.amplitude))
+    start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
     best, value = start, float(objective(torch.from_numpy(start)))
     if looks:
         best, value = walked(objective, [start], bounds, looks, EVIDENCE_SETTLED)
-    kernel = Kernel.of(best[:-1], math.exp(best[-1]))
+    kernel = replace(one.kernel.at(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)

@@ -72,7 +72,7 @@ def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generato
 
     A weight's prior is complex normal of variance 1.
     """
-    count = columns.shape[1]
+    count, single = columns.shape[1], columns.astype(np.complex64)
     weights: np.ndarray = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / math.sqrt(2)
     weights /= math.sqrt(float((np.abs(columns @ weights) ** 2).mean()))
     scale, damping = SCALE_DB, 1e-2
@@ -81,7 +81,7 @@ def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generato
         scale = now.scale()
         now = _Misfit.of(columns, decibels, weights, hidden, scale)
         for _ in range(steps):
-            result = _step(columns, decibels, now, hidden, scale, damping)
+            result = _step(columns, single, decibels, now, hidden, scale, damping)
             if result is None:
                 break
             better, damping = result
@@ -122,13 +122,14 @@ class _Misfit:
 
 
 def _step(
-    columns: np.ndarray, decibels: np.ndarray, now: _Misfit, hidden: float, scale: float, damping: float
-) -> tuple[_Misfit, float] | None:
+    columns: np.ndarray, single: np.ndarray, decibels: np.ndarray, now: _Misfit, hidden: float,
+    scale: float, damping: float,
+) -> tuple[_Misfit, float] | None:  # fmt: skip
     """A better place and the next damping; None where none was found."""
     count = columns.shape[1]
-    slope = (DECIBEL * now.field.conj() / now.power)[:, None] * columns
     # Single precision: a step need not be exact, its worth is judged in double.
-    jacobian = np.concatenate([slope.real, -slope.imag], 1).astype(np.float32)
+    slope = (DECIBEL * now.field.conj() / now.power).astype(np.complex64)[:, None] * single
+    jacobian = np.concatenate([slope.real, -slope.imag], 1)
     share = ((DEGREES + 1) / (DEGREES * scale**2 + now.error**2)).astype(np.float32)
     normal = ((jacobian.T * share) @ jacobian).astype(np.float64)
     right = (jacobian.T @ (share * now.error.astype(np.float32))).astype(np.float64)

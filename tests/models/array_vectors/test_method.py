@@ -26,7 +26,7 @@ from gsparc.models.splat.array import ArrayField
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.kernel import SmoothRough
+from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.training.context import FitContext
 
 SMALL = FieldSettings(count=64)
@@ -77,7 +77,7 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
     mixed[::3] = twin(mixed[::3], partner)
-    kernel = SmoothRough.of_one(0.2, 1e-3)
+    kernel = Kernel.of_one(0.2, 1e-3, term=SmoothRough)
     inverse = np.linalg.inv(kernel.gram(torch.from_numpy(data.tx)).numpy())
     vectors = aligned_by(mixed, data.tx, partner, kernel)
     left_out = vectors - (inverse @ vectors) / np.diag(inverse)[:, None]
@@ -94,7 +94,7 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
 
     data, truth = known_campaign
     x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
-    kernel, at = SmoothRough.of_one(0.15, 0.01), torch.from_numpy(x)
+    kernel, at = Kernel.of_one(0.15, 0.01, term=SmoothRough), torch.from_numpy(x)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
     samples = cross_validation._Samples(

@@ -21,6 +21,7 @@ from gsparc.models.powers.field import PowerField
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
+from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
 
@@ -56,8 +57,8 @@ def db(power: torch.Tensor) -> np.ndarray:
 
 def small_field(data: Measurements, two: bool = True) -> PowerField:
     """Invented settings."""
-    kernel = Kernel((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel((5.0,), (1.0,), 0.2, 9.0)
-    return PowerField.of(data.site, Trend(-70.0), kernel)
+    kernel = Kernel.matern((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel.of_one(5.0, 0.2, 9.0)
+    return PowerField.of(data.site, Prior(kernel, Trend(-70.0)))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])

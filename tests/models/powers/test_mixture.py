@@ -128,4 +128,4 @@ def test_a_mixture_has_slopes():
 
 
 def test_few_rows_have_one_process():
-    assert fitted_to(PowerField(), walks(), np.arange(80))[0].others == ()
+    assert len(fitted_to(PowerField(), walks(), np.arange(80))[0].priors) == 1

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from gsparc.apps.export.compiled.blob import Form, packed
-from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import JITTER, Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.posterior import Exact
@@ -20,7 +19,7 @@ LANES = 8
 
 
 def powers_form(process: PowerProcess, scale: float) -> Form | None:
-    """The form of a process; None where its mean law counts walls.
+    """The form of a process; None where its terms are others than compiled.
 
     Args:
         process: given its rows.
@@ -32,7 +31,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         return Form(5, [len(weights), *weights], named) if len(files) == len(weights) else None
     posterior, kernel, trend = process.posterior, process.kernel, process.trend
-    if type(kernel) is not Kernel or trend.walls is not None:
+    if (signed := kernel.compiled) is None or trend.more:
         return None
     assert isinstance(posterior, (Exact, Nearest))
     every = isinstance(posterior, Exact)
@@ -53,7 +52,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     else:
         whole = posterior.factor.root.numpy()  # type: ignore[union-attr]
         root = whole[np.tril_indices(count)]
-    law, lengths, shares = trend.law, [*kernel.lengths, 1.0][:2], [*kernel.shares, 0.0][:2]
+    law, lengths, shares = trend.law, [*signed, 1.0][:2], [*kernel.shares, 0.0][:2]
     about = [trend.level, 0.0, 1.0] if law is None else [law.level, law.exponent, max(law.floor, TINY_M)]
     beside = np.full((places.shape[1], -(-count // LANES) * LANES), BEYOND)
     beside[:, :count] = places[order].T
@@ -65,7 +64,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     }  # fmt: skip
     numbers = [
         places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, nearest is None, every,
-        law is not None, len(kernel.lengths), shares[0], lengths[0], shares[1], lengths[1], kernel.noise,
+        law is not None, len(signed), shares[0], lengths[0], shares[1], lengths[1], kernel.noise,
         kernel.amplitude, process.heard, process._reach, *about, trend.middle, trend.spread, scale,
     ]  # fmt: skip
     return Form(4, [float(number) for number in numbers], arrays)

@@ -19,7 +19,7 @@ from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.groups import Gain, compared
 from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart, bounds_of
+from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import conditioned
 from gsparc.processes.prior import Prior
@@ -29,7 +29,7 @@ from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
 LOOKS, SETTLED = 40, 1e-6
-START = Kernel((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
 FITTED_ON = 500  # rows of each station, for the law
@@ -60,9 +60,9 @@ class WithTerms(Trend):
         """See `Trend`."""
         return self.inner.mean(places)
 
-    def terms(self, places: Tensor) -> Tensor:
+    def columns(self, places: Tensor) -> Tensor:
         """See `Trend`."""
-        return torch.cat([self.inner.terms(places), self.shared(places) / self.unit], 1)
+        return torch.cat([self.inner.columns(places), self.shared(places) / self.unit], 1)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Own:
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
-                known = conditioned(part, wide, prior.kernel, seed)[0].posterior  # type: ignore[arg-type]
+                known = conditioned(part, Prior(prior.kernel, wide), seed)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
@@ -123,7 +123,7 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
             numbers = []
         for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
-            bounds = bounds_of(2, distance.numpy())
+            bounds = kernel.bounds(distance)
             _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
@@ -149,23 +149,23 @@ def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, 
     few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
     views = {number: _view(few.of(number), trend) for number in few.stations}
     at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
-    far = apart(at, at).numpy()
-    middle = float(np.median(far)) or 1.0
+    far = apart(at, at)
+    middle = float(np.median(far.numpy())) or 1.0
+    start = Kernel.matern([length * middle for length in START.lengths], START.shares, START.noise)
 
     def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
-        return LeftOutDensity.apply(gram_of(at, distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
+        return LeftOutDensity.apply(gram_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
 
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    start = replace(START, lengths=(START.lengths[0] * middle, START.lengths[1] * middle)).parameters()
-    best, _ = walked(objective, [start], bounds_of(2, far), LOOKS, SETTLED)
+    best, _ = walked(objective, [start.parameters().numpy()], start.bounds(far), LOOKS, SETTLED)
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)
-    kernel = Kernel.of(best, math.exp(mean))
+    kernel = replace(start.at(torch.from_numpy(best)), amplitude=math.exp(mean))
     return kernel, {
         number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
         for number, log in zip(views, logs, strict=True)
@@ -176,7 +176,7 @@ def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (n, n) [m], uncertain terms (n, Q) and values less the mean (n, 1) [dB]."""
     places = torch.from_numpy(rows.places)
     values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.terms(places), values[:, None]
+    return apart(places, places), trend.columns(places), values[:, None]
 
 
 def learn_strength(
@@ -196,7 +196,6 @@ def learn_strength(
     """
     heard = rows if rows.silent.all() else rows.loud
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
-    assert isinstance(own.never.kernel, Kernel)
     short = min(own.never.kernel.lengths)
     bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
     if len(few.stations) < LEAST_STATIONS:

@@ -197,7 +197,7 @@ def _by_evidence(
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + bands, 0, dtype=torch.float64))
-    own = [gram @ gram.T for gram in map(rough.terms, places)]
+    own = [gram @ gram.T for gram in map(rough.columns, places)]
     count, last = sum(map(len, places)), [list[Sites]() for _ in parts]
 
     def covariance(i: int, at: Tensor) -> Tensor:
@@ -229,7 +229,7 @@ def _by_evidence(
         gram, quiet = covariance(i, logs), side[i] != 0
         if quiet.any():
             gram.diagonal()[quiet] += last[i][0].variance
-        columns = Factor.of(gram, "raise").whitened(learned.columns(at_))
+        columns = Factor.of(gram, "raise").whitened(learned.shared_columns(at_))
         precision += columns.T @ columns
     doubt, kernel = Factor.of(precision, "raise").root.T, SectorKernel.read(SectorKernel.of(logs).state())
     return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel

@@ -62,8 +62,8 @@ def smooth(places: np.ndarray, length: float, rng: np.random.Generator, count: i
 def prior_of(data: Measurements) -> tuple[Own, Terms]:
     """Invented settings with every term."""
     trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
-    never = Prior(Kernel((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
-    own = Own(never, {1: Prior(Kernel((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
+    never = Prior(Kernel.matern((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
+    own = Own(never, {1: Prior(Kernel.matern((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
     terms = Terms.over(rows_of(data), trend, 8.0, 30, 0)
     return own, replace(terms, place_db=2.7)
 
@@ -164,7 +164,7 @@ def test_the_law_of_a_site():
 def test_settings_become_likelier():
     rows, densities = rows_of(town()), []
     learned, _ = learn_own(rows, 0)
-    begin = Own(replace(learned.never, kernel=Kernel((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {})
+    begin = Own(replace(learned.never, kernel=Kernel.matern((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {})
     for own in (begin, learned):
         posterior = own.given(rows, prior_of(town())[1], 0)
         found = [posterior.left_out(number) for number in rows.stations]
