@@ -83,7 +83,7 @@ def test_too_few_to_test_promise_nothing() -> None:
     score = np.linspace(1, 0, 15)
     found = choose(score, np.zeros(15, bool), levels_of(score), Guarantee(alpha=0.1, delta=0.1))
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
-    with pytest.raises(ValueError, match="between 0 and 1"):
+    with pytest.raises(ValueError, match="above 0 and below 1"):
         Guarantee(alpha=1.5)
 
 

@@ -69,8 +69,10 @@ def compose(*overrides: str, config: str = "train"):
 def runs_in(patch, folder: Path) -> None:
     """Let what is left of a run go to a folder, as Hydra would."""
     from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
 
-    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(runtime=SimpleNamespace(output_dir=folder)))
+    runtime = SimpleNamespace(output_dir=folder)
+    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(runtime=runtime, mode=RunMode.RUN))
 
 
 RENDERED = tuple(

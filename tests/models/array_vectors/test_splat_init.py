@@ -25,9 +25,10 @@ COUNT = "model.field.count=64"
 
 
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):
-    method = build(
+    factory = build(
         compose("logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides).model
     )
+    method = factory.made_for(data)
     method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
     return method
 
