@@ -33,9 +33,11 @@ CDFS: dict[Kind, tuple[str, ...]] = {
 def svg(figure: Figure) -> str:
     """The figure as an SVG element, without the XML head; text stays text."""
     out = io.StringIO()
+    # Text as text is searched and scaled; a fixed salt and no date give equal files for equal runs.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gsparc"}):
         FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
+    # An XML head inside a page is an error of HTML.
     return text[text.index("<svg") :]
 
 
@@ -133,6 +135,7 @@ def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] 
             continue
         share = np.arange(1, len(values) + 1) / len(values)
         count = len(values) if name == TIMES else max(map(len, every))
+        # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
         half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * count))
         axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
         low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
@@ -149,6 +152,7 @@ def learning(runs: Sequence[Run]) -> Figure:
             axes.plot(
                 seconds, values, marker="D" if len(seconds) == 1 else "o", ms=3, lw=1, label=label, **style
             )
+        # A band needs curves with the same number of looks at validation rows.
         if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
             when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
             axes.fill_between(
@@ -188,6 +192,7 @@ def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
 
 def _accuracy_axis(axes: Axes, name: str) -> None:
     axes.set_ylabel(heading_of(name))
+    # Errors span decades; minposy is infinite where none is above 0.
     if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
 
