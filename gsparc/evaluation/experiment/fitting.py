@@ -78,6 +78,7 @@ class Prepared:
     @property
     def expected_s(self) -> float:
         """Seconds it will take: its budget on every fold, and something for scoring [s]."""
+        # Two seconds for loading and scoring a fold: only the time left that is shown depends on it.
         return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
     def result(self) -> Filled | None:
@@ -87,6 +88,7 @@ class Prepared:
 
     def filled(self, facts: dict[str, Any]) -> Filled:
         """The cell with these facts."""
+        # The program's hash, not the commit, decides: most commits change nothing that a method computes.
         earlier = "" if facts.get("program") == self.state.program else str(facts.get("git"))[:8]
         return Filled(self.cell, self.folder, facts, self.problem.draw is not None, earlier)
 
@@ -132,6 +134,7 @@ def fill_all(
     there = [one.result() for one in prepared]
     found = {str(one.cell): one for one in there if one is not None}
     missing = [one for one in prepared if str(one.cell) not in found]
+    # monotonic: setting the machine's clock ends no comparison.
     log.info("%d cells, %d already done", len(prepared), len(found))
     started = time.monotonic()
 

@@ -19,10 +19,12 @@ from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
+# Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, by their columns
     "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
 }  # fmt: skip
+# Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "budget_s", "method"]
@@ -47,6 +49,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
         })  # fmt: skip
     if not rows:
         return pd.DataFrame(columns=CELL)
+    # pandas would make 1.0 of 1 where another row has None.
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
     numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
@@ -88,13 +91,16 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
     rows[["figure", "second"]] = groups[["figure", "second"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["draws"] = several
+    # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
     rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
     rows["value_error"] = groups["value"].sem().where(several)
+    # Of differences on the same draw: draws differ more than methods do.
     rows["behind_error_db"] = groups["behind_db"].sem()
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = rows.reset_index()
     problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
+    # Reversed, so that of a dataset's splits the first remains.
     first = dict(reversed(problems))  # split of each dataset
     times = [
         timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
@@ -113,6 +119,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
     for _, here in cells[cells.draws].groupby(PROBLEM):
         groups = here.groupby(["budget_s", "method"], dropna=False, sort=False).score_db
         count = groups.transform("count")
+        # A method that failed on hard draws has an easier mean: it is no best.
         best = groups.transform("mean")[count == count.max()].idxmax()
         same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
         behind[here.index] = here.seed.map(same) - here.score_db
@@ -149,9 +156,11 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     own = next((row for row in rows if row.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
+        # Independent errors add in squares.
         spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
         level = own.score_db >= first.score_db - spread
         lines.append(gap + (", within the seeds' spread" if level else ""))
+    # False for NaN: methods without a variance have no such figure.
     if own is not None and first.outage > own.outage:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
         lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
@@ -250,6 +259,7 @@ def _cell(row: Any) -> str:
     if not np.isnan(row.value_error):
         value += f" ± {row.value_error:{form}}"
     behind, error = np.nan_to_num([row.behind_db, row.behind_error_db])
+    # Two standard errors of the paired difference: not told from the best.
     if behind <= 2 * error:
         value = f"**{value}**"
     return value if behind == 0 else f"{value} ({behind:.2f} ± {error:.2f} dB)"

@@ -71,6 +71,7 @@ def sweep(
     for index, (_, method) in enumerate(candidates):
         ask = Predictor(method, data.site).cycling(places)
         calls |= {(index, count): ask for count in threads}
+    # A copy of memory, the unit of the others' times, is made by one thread.
     times = interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
     points = []
     for key, ms in times.items():
@@ -104,6 +105,7 @@ class Recorded(View):
 
 def closeness(answers: Tensor, whole: Tensor) -> float:
     """How near answers (n, ...) are to those of the full model [dB]: decides without a single measurement."""
+    # 1e-30: two equal answers, or two of nothing, have no ratio.
     apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
