@@ -43,6 +43,7 @@ def locate(
     """
     site = predictor.site
     if site.kind == "rssi" and not np.iscomplexobj(values):
+        # By way of stored units: users give levels in the unit that answers come in.
         stored = site.power_unit(unit or predictor.unit).stored(torch.as_tensor(values))
         values = stored * site.target_scale
     heard = of_values(site, values, silent)
@@ -58,6 +59,7 @@ def _locator(
     """Of world places (m, 3); None: of the box of the measured ones."""
     site = predictor.site
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
+    # Only what was learned for the same unknowns and share.
     trust = restored(predictor.extra, unknown, share)
     cells = cover(local, MOST, places is not None)
     return Locator(SiteField(predictor), cells, unknown, trust, share)

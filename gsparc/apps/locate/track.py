@@ -30,6 +30,7 @@ def speed(places: np.ndarray, seconds: np.ndarray, walk: np.ndarray) -> float:
     order = np.lexsort((seconds, walk))
     gone, took = np.linalg.norm(np.diff(places[order], axis=0), axis=1), np.diff(seconds[order])
     moved = (np.diff(walk[order]) == 0) & (took > 0)
+    # A median: standing still and single jumps of recorded places leave it alone.
     return float(np.median(gone[moved] / took[moved])) if moved.any() else 0.0
 
 
@@ -51,14 +52,18 @@ def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s:
         before = mass[order[0]]
         for start, end in pairwise(order):
             cell = np.median(np.r_[cells[start].edge.max(1), cells[end].edge.max(1)])
+            # Never less than half a cell, or a slow step between two centres would be impossible.
             spread = max(metres_per_s * abs(seconds[end] - seconds[start]) / np.sqrt(2), cell / 2)
             near = cdist(cells[end].centre, cells[start].centre, "sqeuclidean")
             normal = (2 * np.pi * spread**2) ** ((cells[end].edge.max(0) > 0).sum() / 2)
+            # Divided by its sum: over a long track products of masses would underflow.
             step = np.exp(near / (-2 * spread**2)) @ (before / before.sum()) / normal
+            # A hundredth of steps goes anywhere, so that one wrong snapshot does not forbid all later ones.
             density = (1 - ANYWHERE) * step + ANYWHERE / posteriors[end].cells.size.sum()
             over[end], before = over[end] * density, mass[end] * density
 
     product = list(mass)
+    # Forwards, then backwards: each snapshot's own mass counts once in the product.
     passed(product, order)
     passed(product, order[::-1])
     return [
