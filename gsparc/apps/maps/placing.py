@@ -22,6 +22,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
 Goal = Literal["coverage", "worst"]
+# A tenth of the area may lie below it: the least of all cells would be one behind a wall.
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
@@ -130,6 +131,7 @@ def place_next(
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells)
         goals = np.empty(3)
+        # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
             if goal == "worst":
                 goals[k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
@@ -155,8 +157,10 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStation:
     heard = np.unique(data.station[known])
     if len(heard) < LEAST_STATIONS:
         return NewStation()
+    # By the seed of the training: the same stations are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
+    # Without validation rows: the station left out is the test, all else is learned from.
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])

@@ -104,21 +104,25 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
     if settings.budget_s is not None:
         learned = replace(learned, context=replace(learned.context, budget_s=settings.budget_s))
     longest = float(np.ptp(places[:, -3:-1], axis=0).max())
+    # A tenth of the site: blocks large against the distance between rows, and some hundred of them.
     side = settings.block_m or longest / 10
     if not side > 0:
         raise DataError("a promise about a map needs rows at more than one place; measure more")
 
     def evidence_without(number: int) -> Evidence:
+        # Every second fold with sides twice as long, for evidence at larger distances.
         split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
         cut = learned.cut(1, settings.seed + number // len(SIDES), split)
         inner = learned.answerable(cut.folds[0])
         less = learned.without(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
+        # Blocks of two folds are never one, though they may hold the same rows.
         unit = cut.unit[tried] + number * (len(data) + 1)
         return evidence_of(less, data, replace(inner, test=tried), unit)
 
     by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    # In the order of folds, whichever ended first: evidence must not depend on it.
     parts = [by_number[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_of(data, learned.rows), side)

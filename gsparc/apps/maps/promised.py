@@ -34,6 +34,7 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
         return None
     stored = checkpoint.read(path)
     promise = None if settings.get("renew") else stored_promise(stored.extra)
+    # Blocks of another size are other evidence.
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
     learned = trained(path, settings["dataset"])
@@ -57,6 +58,7 @@ def trained(path: str, dataset: dict[str, Any]) -> Learned:
         raise DataError(
             f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
         ) from None
+    # Rows of other data are no evidence of what this model has not seen.
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
     return learned
