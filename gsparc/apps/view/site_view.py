@@ -75,6 +75,7 @@ class SiteView:
     def station(self, name: str | None) -> StationView:
         """Of a station; made when it is first asked for, which takes seconds. Those made wait for nobody."""
         if name not in self._made:
+            # Two clients that ask for a new station at once wait for one making of it.
             with self._lock:
                 if name not in self._made:
                     self._made[name] = self._make(name)
