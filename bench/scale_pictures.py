@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
 
+# Exact methods cost count^3: their slope would tilt that of what follows.
 MANY = 10_000  # rows from which slopes are taken: fewer are of exact methods, or too quick to time
 FIT, QUERY = ("fit_cpu_s", "processor seconds of a fit"), ("query_cpu_ms", "processor ms of one query")
 PANELS = {
@@ -47,6 +48,7 @@ def draw(tables: Path, pictures: Path) -> None:
 def _curves(place: Axes, lines: pd.DataFrame, quantity: str) -> None:
     """A figure of every method against rows; slopes of seconds stand in the legend."""
     for name, own in lines.sort_values("rows", kind="stable").groupby("method", sort=False):
+        # Two standard errors, about 95 %.
         errors = 2 * own["rmse_error"] if quantity == "rmse" else None
         exponent = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
         label = name if np.isnan(exponent) else f"{name}, slope {exponent:.2f}"
