@@ -49,7 +49,7 @@ HEAD = (
 
 
 def make(name: str) -> MethodFactory:
-    """What makes the method, with what `model=` sets."""
+    """Return what makes the method, with what `model=` sets."""
     from hydra import compose, initialize_config_module
 
     from gsparc.models.registry import build
@@ -78,7 +78,7 @@ def peak_gb() -> float:
 
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
-    """A line of one method."""
+    """Write a line of one method."""
     before, private, factory = peak_gb(), Private(), for_stations(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
@@ -111,7 +111,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
 def each(
     source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any]
 ) -> None:
-    """A line of every method, each fitted in a child that the measurements are shared with."""
+    """Write a line of every method, each fitted in a child that shares the measurements."""
     for name in methods:
         make(name)  # imports it, so that no child does
     for name in methods:
@@ -191,7 +191,7 @@ def spectra(folder: Path, counts: Sequence[int], methods: Sequence[str] = SPECTR
 
 
 def main(kind: str, *rest: str) -> None:
-    """See the head of this file."""
+    """Do what the head of this file says."""
     counts = [int(word) for word in rest[1:] if word.isdigit()]
     methods = [word for word in rest[1:] if not word.isdigit()]
     if kind == "powers":

@@ -22,7 +22,7 @@ PANELS = {
 
 
 def slope(lines: pd.DataFrame, figure: str) -> float:
-    """Of a figure against rows, both as logarithms, least squares from `MANY` rows on; NaN of one point."""
+    """Return the slope of a figure over rows, both as logarithms, from `MANY` rows on; NaN of one point."""
     many = lines[lines["rows"] >= MANY]
     if len(many) < 2:
         return float("nan")
@@ -30,7 +30,7 @@ def slope(lines: pd.DataFrame, figure: str) -> float:
 
 
 def draw(tables: Path, pictures: Path) -> None:
-    """A picture for each source that was measured."""
+    """Save a picture for each source that was measured."""
     for kind, quantities in PANELS.items():
         path = tables / f"{kind}.csv"
         for source, own in pd.read_csv(path).groupby("source", sort=False) if path.exists() else ():

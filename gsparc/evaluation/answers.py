@@ -186,7 +186,7 @@ def answers(
 
 
 def target(out: str | None, places: Path, overwrite: bool) -> Path:
-    """Where predictions go: `out`, or beside the places.
+    """Return where predictions go: `out`, or beside the places.
 
     Raises:
         DataError: another ending, the places themselves, or a file that is there already.
@@ -216,7 +216,7 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
 
 
 def suffix(unit: PowerUnit) -> str:
-    """Of columns and figures of powers: `db` of any levels, else the unit."""
+    """Return the ending of columns and figures of powers: `db` of any levels, else the unit."""
     return "db" if unit.decibels else unit.name
 
 

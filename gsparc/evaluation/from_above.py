@@ -67,7 +67,7 @@ def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", 
 
 
 def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
-    """A dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
+    """Draw a dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
     how: dict[str, Any] = {
         "linestyle": "",
         "color": "k",
@@ -116,7 +116,7 @@ def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", abo
 
 
 def scale_bar(axis: Any) -> None:
-    """A bar of a round length, about a fifth of the map wide."""
+    """Draw a bar of a round length, about a fifth of the map wide."""
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     decade = 10.0 ** np.floor(np.log10((right - left) / 5))
     length = max(one for one in (1, 2, 5) if one * decade <= (right - left) / 5) * decade
@@ -131,7 +131,7 @@ def scale_bar(axis: Any) -> None:
 
 
 def legend_below(figure: Any, columns: int = 3) -> Any:
-    """What marks are, beneath the map; returns the legend, None where nothing has a label."""
+    """Say beneath the map what marks are; returns the legend, None where nothing has a label."""
     if not any(axis.get_legend_handles_labels()[0] for axis in figure.axes):
         return None
     return figure.legend(loc="outside lower left", ncols=columns, fontsize="small", frameon=False)

@@ -70,7 +70,7 @@ class Opened:
         return Predictor(self.methods[0], site, trusted=confidence.trusted_of(extra), extra=extra)
 
     def retraining(self, **others: Any) -> Learned:
-        """The first method with what it learned from; what makes it unfitted is of gsparc's classes alone.
+        """Return the first method with what it learned from; only classes of gsparc make it unfitted.
 
         Args:
             **others: of `FitContext`, in place of the run's.
@@ -174,7 +174,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
 
 
 def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
-    """Whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
+    """Return whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
     """

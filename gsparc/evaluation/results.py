@@ -61,5 +61,5 @@ def _of_method(name: str, figures: Mapping[str, Any], times: Mapping[str, Any]) 
 
 
 def score_db(row: Mapping[str, Any]) -> float:
-    """The figure that places are given by, as decibels of which more are better."""
+    """Return the figure that places are given by, as decibels of which more are better."""
     return score_of(row["figure"], float(row["value"])) + 0.0  # -0.0 would be shown as such

@@ -49,7 +49,7 @@ class Scores:
         return self.samples["error_db"] ** 2 if self.kind == "rssi" else self.samples["mse"]
 
     def decided_by(self) -> dict[str, Any]:
-        """The row that alone makes more than half of all error or power, and a figure that no row decides.
+        """Return the row that alone makes over half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
         |h|^2; empty where no row weighs so much, there are few, or errors are in decibels.
@@ -119,7 +119,7 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
 
 
 def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
-    """What predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
+    """Return what predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
 
     A run has a phase of its own, which nothing tells of one that was not learned from.
     """

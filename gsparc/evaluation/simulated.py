@@ -22,7 +22,7 @@ CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
-    """From above: received power, delay spread and, after `auto`, where a dropped effect mattered.
+    """Draw from above: received power, delay spread and, after `auto`, where a dropped effect mattered.
 
     Of several transmitters, the strongest at each place.
     """

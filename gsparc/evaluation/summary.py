@@ -66,7 +66,7 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
 
 
 def new_run_id() -> str:
-    """What all files of a run carry, so that those of two are not read together; sorts by time."""
+    """Return what all files of a run carry, so that those of two are not read together; sorts by time."""
     # 8 digits of a random id: two jobs of a sweep may begin in one second.
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
@@ -118,7 +118,7 @@ def result_rows(
 
 
 def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
+    """Return a table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
     result = Table(title=title)
     for column in (*words, *numbers):
         result.add_column(column, justify="left" if column in words else "right")
@@ -136,7 +136,7 @@ def markdown_table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers:
 
 
 def shown(value: float | None, form: str) -> str:
-    """A number in a format, or a dash where there is none or NaN."""
+    """Return a number in a format, or a dash where there is none or NaN."""
     return "-" if value is None or math.isnan(value) else format(value, form)
 
 
@@ -183,7 +183,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
 
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """The row that alone decides sums over all rows, if one does, and the median beside them."""
+    """Return the row that alone decides sums over all rows, if one does, and the median beside them."""
     row, name, share, median = (
         facts.get(f"{prefix}/decided_by/{key}") for key in ("row", "name", "share", "nmse_median")
     )
@@ -198,7 +198,7 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """The baseline that beats the method, if one does; where rows were silent, these count too."""
+    """Return the baseline that beats the method, if one does; where rows were silent, these count too."""
     figure = WITH_SILENT if f"{prefix}/{WITH_SILENT}" in facts else DECIDING[facts["dataset/kind"]]
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]

@@ -84,7 +84,7 @@ class Connection(H11Protocol):
         other.transport.abort()
 
     def works(self) -> bool:
-        """Whether the answer to a whole request is computed, or written to a client that reads."""
+        """Return whether the answer to a whole request is computed, or written to a client that reads."""
         cycle = self.cycle
         return bool(cycle) and not (cycle.more_body or cycle.response_complete or self.flow.write_paused)
 
@@ -189,7 +189,7 @@ class Batcher:
 
 
 def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
-    """The routes: POST /predict, and /std for its deviations, GET /healthz.
+    """Return the routes: POST /predict, and /std for its deviations, GET /healthz.
 
     Args:
         predictor: of one end that moves and one station.

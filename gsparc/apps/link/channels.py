@@ -53,7 +53,7 @@ class Channels:
         return Channels(self.true[at], self.predicted[at], *rest)
 
     def band(self) -> Band:
-        """The first antenna's; what states no variance is taken for exact."""
+        """Return the first antenna's band; what states no variance is taken for exact."""
         return Band(self.true[:, 0], self.predicted[:, 0], self.variance.nan_to_num(0.0))
 
 

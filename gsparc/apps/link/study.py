@@ -22,7 +22,7 @@ LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 d
 
 
 def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
-    """Where a falling curve over its index first crosses `target`, linear in its logarithm; None: never."""
+    """Return where a curve over its index first falls below `target`, linear in its logarithm, or None."""
     # No error in all blocks sent: its logarithm is cut at 1e-6.
     x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
     for i in range(len(x) - 1):
@@ -43,7 +43,7 @@ def gain(true: Tensor, predicted: Tensor) -> Tensor:
 
 
 def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
-    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
+    """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN where it is 0."""
     best = gain(true, true)
     # Largest of both: a beam into a null would be infinitely bad.
     return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
@@ -236,7 +236,7 @@ def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str,
 def acceptance(
     blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]
 ) -> tuple[float, pd.DataFrame]:
-    """The Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
+    """Return the Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
 
     Of the surest `shares` of positions by `score` (P,), the index; receivers are the columns.
     """

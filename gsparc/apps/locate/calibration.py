@@ -20,7 +20,7 @@ LOOKS = 160
 def calibrated(
     snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
 ) -> Trust:
-    """The trust under which places that were held out are most likely, with an area that holds a share.
+    """Return the trust under which held-out places are most likely, with an area that holds a share.
 
     All numbers but the level maximise the mean log density at the true places, a proper score; the level is
     then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
@@ -59,7 +59,7 @@ def calibrated(
 
 
 def levelled(trust: Trust, snapshots: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
-    """The trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
+    """Return the trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
     levels = np.sort([one.by(trust).level(place) for one, place in zip(snapshots, places, strict=True)])
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))

@@ -68,7 +68,7 @@ class Localisation:
     facts: dict[str, Any]
 
     def columns(self, inside: Sequence[bool]) -> dict[str, Any]:
-        """Of `locate.csv`, in the world's coordinates [m]."""
+        """Return the columns of `locate.csv`, in the world's coordinates [m]."""
         located = next(iter(self.answers.values()))
         place, true = np.array([one.place for one in located]), self.heard.place
         columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
@@ -128,7 +128,7 @@ def report(
 def by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
 ) -> Localisation:
-    """A trained model locates its test rows, or those of a file.
+    """Locate the test rows of a trained model, or those of a file.
 
     Args:
         config: see conf/locate.yaml.
@@ -197,7 +197,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
 
 
 def by_fingerprints(config: DictConfig) -> Localisation:
-    """A field of fingerprints is learned, and rows that it did not learn from are located.
+    """Learn a field of fingerprints, and locate rows that it did not learn from.
 
     Args:
         config: see conf/locate.yaml.

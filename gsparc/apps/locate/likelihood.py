@@ -41,11 +41,11 @@ class Misfit:
         return Misfit(squared, size, self.count, silent)
 
     def at(self, places: Tensor) -> Misfit:
-        """At places (g,) by number."""
+        """Return the misfit at places (g,) by number."""
         return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 
     def of(self, snapshot: int) -> Misfit:
-        """Of one snapshot."""
+        """Return the misfit of one snapshot."""
         one = slice(snapshot, snapshot + 1)
         return Misfit(self.squared[one], self.size[one], self.count[one], self.silent[one])
 
@@ -84,7 +84,7 @@ class Trust:
 
 
 def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
-    """Of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
+    """Return the misfit of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
     spread = variance[:, 0].clamp_min(TINY)
     # |v - m|^2 as |v|^2 - 2 v m + |m|^2: one matrix product instead of an array (n, G, P).
     squared = values.square().sum(1)[:, None] - 2 * values @ mean.T + mean.square().sum(1)
@@ -95,7 +95,7 @@ def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
 
 
 def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: bool) -> Misfit:
-    """Of complex values (n, P), NaN where missing, by means and variances (G, P).
+    """Return the misfit of complex values (n, P), NaN where missing, by means and variances (G, P).
 
     Without a known phase each snapshot is turned to where it fits best.
     """
@@ -113,7 +113,7 @@ def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: boo
 def of_levels(
     values: Tensor, mean: Tensor, variance: Tensor, offset_db: float = 0.0, floor: Tensor | None = None
 ) -> Misfit:
-    """Of powers (n, P) [dB], NaN where missing, by means (G, P) [dB] and variances (G, P) [dB^2].
+    """Return the misfit of powers (n, P) [dB], NaN where missing, by means, variances (G, P) [dB, dB^2].
 
     Args:
         values: what was heard.

@@ -20,7 +20,7 @@ SHIFTS, NEAR = 20, 0.01  # steps up the density at most, and of a width that the
 
 
 def likeliest(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
-    """The densest cells (c,) of G that hold a share of the mass, densest first."""
+    """Return the densest cells (c,) of G that hold a share of the mass, densest first."""
     order = np.argsort(-log_density, kind="stable")
     return order[: int(np.searchsorted(np.cumsum((np.exp(log_density) * size)[order]), share)) + 1]
 
@@ -98,7 +98,7 @@ class Posterior:
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
 
     def peak(self) -> np.ndarray:
-        """The likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
+        """Return the likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
 
         By mean shift, which needs no step length (D. Comaniciu and P. Meer, "Mean shift: a robust approach
         toward feature space analysis", IEEE TPAMI 24 (2002)).
@@ -113,7 +113,7 @@ class Posterior:
         return place
 
     def within(self, share: float) -> np.ndarray:
-        """The most likely cells (c,) that hold a share of the mass, most likely first."""
+        """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
         return likeliest(self.log_density, self.cells.size, share)
 
     def modes(self, share: float) -> list[np.ndarray]:

@@ -35,7 +35,7 @@ def speed(places: np.ndarray, seconds: np.ndarray, walk: np.ndarray) -> float:
 
 
 def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s: float) -> list[Posterior]:
-    """What is known of each place given all snapshots of a track, over its heaviest cells.
+    """Return what is known of each place given all snapshots of a track, over its heaviest cells.
 
     Args:
         posteriors: of each snapshot on its own, by an even prior.
@@ -73,7 +73,7 @@ def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s:
 
 
 def as_looked(posterior: Posterior) -> Looked:
-    """The same for calibration: of a trust its temperature alone changes it."""
+    """Return the same for calibration: of a trust its temperature alone changes it."""
     density = torch.from_numpy(posterior.log_density)[None]
     none = torch.zeros_like(density)
     return Looked(posterior.cells, Misfit(none, none, none[:, 0], density))

@@ -82,13 +82,13 @@ class FieldMap:
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
     def strongest(self, layers: np.ndarray) -> np.ndarray:
-        """Of layers (T, ny, nx), that of each cell's strongest station (ny, nx); NaN where refused."""
+        """Return that of layers (T, ny, nx) of each cell's strongest station (ny, nx); NaN where refused."""
         number = np.maximum(self.best_server, 0).astype(np.int64)
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
     def raised(self, decibels: float, unit: str) -> FieldMap:
-        """The same map with levels so many decibels higher, which is in another unit."""
+        """Return the same map with levels so many decibels higher, which is in another unit."""
         # Errors and probabilities do not change with the unit, differences of levels neither.
         levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
         return replace(self, **levels, threshold_db=self.threshold_db + decibels, unit=unit)
@@ -114,7 +114,7 @@ class FieldMap:
 
     @classmethod
     def read(cls, path: str | Path) -> FieldMap:
-        """What `save` wrote; without measured places, stations' places and notes, which it does not hold.
+        """Return what `save` wrote; it does not hold measured places, stations' places and notes.
 
         Raises:
             DataError: no such file, or not one of a map.
@@ -269,7 +269,7 @@ def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequenc
 
 
 def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
-    """Whether a GeoTIFF is written; None: where it can be.
+    """Return whether a GeoTIFF is written; None: where it can be.
 
     Raises:
         DataError: it is asked for, and cannot be.

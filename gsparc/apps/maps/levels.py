@@ -62,7 +62,7 @@ def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def joint_of(method: Method) -> HasJoint | None:
-    """What knows how levels of all its stations go together; None where each is by itself."""
+    """Return what knows how levels of all its stations go together; None where each is by itself."""
     every = method.every() if isinstance(method, PerStation) else None
     return None if every is None else every.joint()
 

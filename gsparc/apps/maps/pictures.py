@@ -62,7 +62,7 @@ class Legend:
 
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
-        """From the 1 to the 99 % quantile of those values that are finite."""
+        """Return colours from the 1 to the 99 % quantile of those values that are finite."""
         known = values[np.isfinite(values)]
         # One and 99 %: a cell at a mast would leave one colour for the rest.
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
@@ -181,7 +181,7 @@ def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], doubt: An
 
 
 def file_name(layer: Layer) -> str:
-    """Of its PNG, without what a file system may not like."""
+    """Return the name of its PNG, without what a file system may not like."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
@@ -247,7 +247,7 @@ def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **
 
 
 def draw_plan(axis: Any, plan: FloorPlan) -> None:
-    """The floor plan, where it lies."""
+    """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     a, b, c, d, e, f = plan.matrix()
     turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
@@ -306,7 +306,7 @@ def draw_plan_picture(
 
 
 def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
-    """The goal at every candidate, the stations that stand, and the best place."""
+    """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     label = f"share of the area with {threshold_db:g} {unit} or more"

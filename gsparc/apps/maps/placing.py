@@ -189,7 +189,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np
 
 
 def unheard_stations_error(what: str) -> DataError:
-    """For models that know no station but those they learned from."""
+    """Return the error for models that know no station but those they learned from."""
     return DataError(
         f"{what}: answers only for the stations that it heard; train with stations=together, for example "
         "model=gp or distance_law"
@@ -197,12 +197,12 @@ def unheard_stations_error(what: str) -> DataError:
 
 
 def number(what: Goal, value: float, unit: str = "dB") -> str:
-    """A goal's value with its unit."""
+    """Return a goal's value with its unit."""
     return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
 
 
 def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
-    """A goal's value in words."""
+    """Return a goal's value in words."""
     if what == "coverage":
         return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
     return f"nine tenths of the area have {number(what, value, unit)} or more"

@@ -157,7 +157,7 @@ def coarse_grid(
     plan: FloorPlan | None = None,
     promise: Promise | None = None,
 ) -> Grid:
-    """About `TARGETS` cells; where nobody says which, those that a promise reaches."""
+    """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
     fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
@@ -297,7 +297,7 @@ class Tour:
 
     @staticmethod
     def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
-        """Of a walk through places (n, 2 or 3) in their order [m]."""
+        """Return the length of a walk through places (n, 2 or 3) in their order [m]."""
         stops = places[:, :2] if start is None else np.vstack([start, places[:, :2]])
         return float(np.hypot(*np.diff(stops, axis=0).T).sum()) if len(stops) > 1 else 0.0
 

@@ -71,7 +71,7 @@ class Promise:
         return cross_validated(self.evidence, share)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
-        """From local places (n, D) to the nearest that was learned from (n,) [m]."""
+        """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
         return distances(self.known, self.station, places, np.full(len(places), station))
 
     def keep(self, path: str | Path) -> None:
@@ -80,7 +80,7 @@ class Promise:
 
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
-    """What a checkpoint's `extra` holds; None where its map was never calibrated."""
+    """Return what a checkpoint's `extra` holds; None where its map was never calibrated."""
     state = extra.get(KEY)
     if state is None:
         return None
@@ -129,7 +129,7 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
 
 
 def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
-    """Of the test rows of a fold, which `method` was fitted to; `block` (n,) says which belong together."""
+    """Return evidence of a fold's test rows, by the `method` fitted to it; `block` (n,): of one held out."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
     level, side = measured(data, rows)

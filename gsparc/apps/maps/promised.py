@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
-    """The evidence stored with a model, or gathered from its training data and then stored.
+    """Return the evidence stored with a model, or gathered from its training data and then stored.
 
     Args:
         path: the model's file.
@@ -46,7 +46,7 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
 
 
 def trained(path: str, dataset: dict[str, Any]) -> Learned:
-    """A model with the very data and rows that it was trained on.
+    """Return a model with the very data and rows that it was trained on.
 
     Raises:
         DataError: they are gone, or are others.
@@ -65,7 +65,7 @@ def trained(path: str, dataset: dict[str, Any]) -> Learned:
 
 
 def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
-    """What a reader of the map must know."""
+    """Return what a reader of the map must know."""
     notes = [*field.notes]
     figures = field.figures()
     share = figures["map/server_unsure"]

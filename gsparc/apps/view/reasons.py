@@ -50,8 +50,8 @@ class Usual:
 
 
 def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
-    """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
-    NaN where that is unknown."""
+    """Return the distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or
+    (n, 3); NaN where that is unknown."""
     known = np.isfinite(level_db)
     tree = cKDTree(places if other is None or other.ndim == 1 else np.column_stack([other, places]))
     level = level_db[known]
@@ -178,7 +178,7 @@ def headline(answer: Answer, unit: str = "dB") -> str:
 
 
 def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
-    """An answer and why, for a panel."""
+    """Return an answer and why, for a panel."""
     lines = [f"**{headline(answer, unit)}**", ""]
     lines += [
         f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"

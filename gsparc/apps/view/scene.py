@@ -25,7 +25,7 @@ class Frame:
 
     @classmethod
     def around(cls, places: np.ndarray) -> Frame:
-        """A frame in which places (n, 3) [m] are about `EXTENT` wide."""
+        """Return a frame in which places (n, 3) [m] are about `EXTENT` wide."""
         low, high = places.min(axis=0), places.max(axis=0)
         # 1 mm: a single place has a frame, too.
         return cls((low + high) / 2, EXTENT / max(float((high - low).max()), 1e-3))
@@ -131,5 +131,5 @@ class Scene:
     notes: tuple[str, ...] = ()
 
     def part(self, name: str) -> Part | None:
-        """The part of that name, if it is there."""
+        """Return the part of that name, if it is there."""
         return next((part for part in self.parts if part.name == name), None)

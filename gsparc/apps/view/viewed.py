@@ -80,7 +80,7 @@ class Viewed:
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
     def predictor_of(self, station: str | None) -> Predictor:
-        """Of a station."""
+        """Return the predictor of a station."""
         return self.predictor if station is None else self.predictor.at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:

@@ -36,7 +36,7 @@ class Contender:
     only_longest: bool = False
 
     def serves(self, problem: Problem) -> bool:
-        """Whether it can take part."""
+        """Return whether it can take part."""
         kind = not self.kinds or problem.kind in self.kinds
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
         return kind and problem.stations >= self.stations and problem.scene >= self.scene

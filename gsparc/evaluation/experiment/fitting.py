@@ -82,12 +82,12 @@ class Prepared:
         return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
     def result(self) -> Filled | None:
-        """The result, if it is done."""
+        """Return the result, if it is done."""
         facts = finished(self.folder, self.state, self.reuse)
         return None if facts is None else self.filled(facts)
 
     def filled(self, facts: dict[str, Any]) -> Filled:
-        """The cell with these facts."""
+        """Return the cell with these facts."""
         # The program's hash, not the commit, decides: most commits change nothing that a method computes.
         earlier = "" if facts.get("program") == self.state.program else str(facts.get("git"))[:8]
         return Filled(self.cell, self.folder, facts, self.problem.draw is not None, earlier)

@@ -29,7 +29,7 @@ from gsparc.training.time_budget import Clock, less_repeatable
 
 
 def context_of(config: DictConfig, **others: Any) -> FitContext:
-    """The context of a fit as a composed configuration says, and what is given.
+    """Return the context of a fit as a composed configuration says, and what is given.
 
     Args:
         config: its seed, effort, budget, split, `init_from`, batch size, Trainer and callbacks.
@@ -83,14 +83,14 @@ class Outcome:
     cost: Cost = NO_COST
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
-        """The same fits with figures, of what they learned from or of other data, as displaced queries."""
+        """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
         started = time.perf_counter()
         figures = pooled(score(self.methods, data, split, eval_on), data, split)
         return replace(self, figures=figures, score_s=time.perf_counter() - started)
 
 
 def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
-    """The contexts of its folds, each with a folder and series of figures of its own."""
+    """Return the contexts of its folds, each with a folder and series of figures of its own."""
     return [whole.within(f"fold{number}") for number in range(len(split.folds))]
 
 

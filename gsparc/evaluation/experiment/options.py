@@ -37,7 +37,7 @@ NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is 
 
 
 def given() -> dict[str, str]:
-    """What the command line and its experiment file say: words by dotted names of settings."""
+    """Return what the command line and its experiment file say: words by dotted names of settings."""
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
@@ -69,7 +69,7 @@ def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]
 
 
 def noting(config: DictConfig, method: MethodFactory) -> Reads:
-    """What is to be noted of the options that were `given` to what `config.model` describes."""
+    """Return what is to be noted of the options that were `given` to what `config.model` describes."""
     options = []
     for path in given():
         group, _, name = path.rpartition(".")

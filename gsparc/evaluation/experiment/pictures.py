@@ -60,7 +60,7 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path) -> None:
-    """A panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
+    """Draw a panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
     splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):

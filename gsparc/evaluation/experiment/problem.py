@@ -93,7 +93,7 @@ class Problem:
 
 
 def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
-    """A group of named settings of conf/compare.yaml: `methods` or `splits`; an empty entry has defaults.
+    """Return named settings of conf/compare.yaml, `methods` or `splits`; an empty entry has defaults.
 
     Raises:
         ValueError: an entry with an unknown setting, or without one that is needed.
@@ -132,7 +132,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
 def compose(
     settings: Mapping[str, Any], overrides: Sequence[str], draw: int | None = None, seed: int | None = None
 ) -> DictConfig:
-    """The configuration `train.py` would see.
+    """Return the configuration `train.py` would see.
 
     Args:
         settings: of its dataset; `dataset` is the choice itself, and left out.

@@ -61,7 +61,7 @@ class Condition:
         return self if self.changes_training else Condition()
 
     def model(self, folder: Path) -> Path:
-        """Where the model that was trained so is, in the folder of its cell."""
+        """Return where the model that was trained so is, in the folder of its cell."""
         return folder / str(self.learned).replace(" ", "-") / checkpoint.MODEL
 
     def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -260,7 +260,7 @@ class Effects:
     title: ClassVar[str] = "what effects cost and gain"
 
     def conditions(self) -> list[Condition]:
-        """The data as they are."""
+        """Return the data as they are."""
         return [Condition()]
 
 
@@ -310,12 +310,12 @@ class Measured:
             raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
 
     def conditions(self) -> list[Condition]:
-        """A condition per training set, called `keep`."""
+        """Return a condition per training set, called `keep`."""
         return [Condition("keep", float(keep)) for keep in self.keep]
 
 
 def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
-    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same.
+    """Move where the end of `rows` is believed by N(0, error_m^2) per coordinate; all else stays the same.
 
     Rows of one place, heard by several stations, are believed to be at one place.
     """
@@ -357,7 +357,7 @@ def turned(
 
 
 def thinned(fold: Fold, keep: float, seed: int) -> Fold:
-    """A fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
+    """Return a fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
 
     Args:
         fold: its training and validation rows are thinned alike, its test rows stay.

@@ -56,7 +56,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
 
 
 def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
-    """The cells of a method under one budget, averaged over seeds or over draws of the split.
+    """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
@@ -127,7 +127,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
 
 
 def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
-    """A table per dataset, split and budget, best first; methods without a budget stand in each."""
+    """Return a table per dataset, split and budget, best first; methods without a budget stand in each."""
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
         without = here.budget_s.isna()
@@ -147,7 +147,7 @@ def title_of(block: pd.DataFrame) -> str:
 
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
-    """What the table shows about simple baselines and about our own default, favourable or not."""
+    """Return what the table shows about simple baselines and about our own default, favourable or not."""
     rows = list(block.itertuples())
     first = rows[0]
     lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]

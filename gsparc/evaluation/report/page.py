@@ -77,7 +77,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 
 
 def warnings(runs: Sequence[Run]) -> list[str]:
-    """What a reader must know first, each once: the loads of a busy machine are one range."""
+    """Return what a reader must know first, each once: the loads of a busy machine are one range."""
     # Loads differ from run to run: as remarks of their own there would be one a run.
     remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
     scored = [run for run in runs if run.row["value"] is not None]
@@ -105,7 +105,7 @@ def _png(path: Path) -> str:
 
 
 def html(title: str, note: str, sections: Sequence[Study]) -> str:
-    """The page; `note` says where it comes from."""
+    """Return the page; `note` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
 

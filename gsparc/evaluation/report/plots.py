@@ -31,7 +31,7 @@ CDFS: dict[Kind, tuple[str, ...]] = {
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element, without the XML head; text stays text."""
+    """Return the figure as an SVG element, without the XML head; text stays text."""
     out = io.StringIO()
     # Text as text is searched and scaled; a fixed salt and no date give equal files for equal runs.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gsparc"}):
@@ -94,7 +94,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
-    """The figure that ends a sweep: distributions over test samples and of single queries, as a PNG file.
+    """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """

@@ -85,7 +85,7 @@ class Run:
         return own | {name: value for name, _, value in chosen if value}
 
     def swept(self, name: str) -> bool:
-        """Whether the command line set it."""
+        """Return whether the command line set it."""
         return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     @property
@@ -140,7 +140,7 @@ def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
-    """The runs with only those overrides in which they differ, so that names are short."""
+    """Return the runs with only those overrides in which they differ, so that names are short."""
     if len(runs) < 2:
         return list(runs)
     # What all runs set tells none from another.
@@ -161,7 +161,7 @@ def _facts(file: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a directory.
+    """Return the run in a directory.
 
     Raises:
         ValueError: its files are of two runs.
@@ -185,7 +185,7 @@ def read_run(folder: Path) -> Run:
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
-    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file or rows."""
+    """Return a CSV file by column: numbers float64 (NaN where empty), else text; {} without file or rows."""
     if not path.is_file():
         return {}
     # A sample or method may be called NA: only empty cells are missing.
@@ -208,7 +208,7 @@ def _config(path: Path) -> dict[str, Any]:
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
-    """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
+    """Return a per-sample figure (n,) of a run, empty where it has none; an error by its size."""
     values = run.samples.get(name, np.zeros(0))
     return np.abs(values) if name == "error_db" else values
 
@@ -217,7 +217,7 @@ log = logging.getLogger(__name__)
 
 
 def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
-    """The runs with the times of single queries, each also written to its `render_ms.csv`.
+    """Return the runs with the times of single queries, each also written to its `render_ms.csv`.
 
     A sweep runs jobs at the same time, which disturbs their times; call this after it.
 

@@ -58,7 +58,7 @@ def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int =
 
 
 def interval(row: Row, figure: str) -> Interval | None:
-    """A test figure of a row with its bootstrap interval over test samples; None without the figure."""
+    """Return a test figure of a row with its bootstrap interval over test samples, or None."""
     # Baselines have no samples of their own here, only figures.
     value, parts = row.get(figure), None if row["baseline"] else _parts(row["run"].samples, figure)
     if value is None:
@@ -105,11 +105,11 @@ class Column:
     of: str | Callable[[Row], Any] = ""
 
     def value(self, row: Row) -> Any:
-        """What a result has in this column: text, a number, an interval or None."""
+        """Return what a result has in this column: text, a number, an interval or None."""
         return row.get(self.of) if isinstance(self.of, str) else self.of(row)
 
     def text(self, value: Any) -> str:
-        """A cell as text."""
+        """Return a cell as text."""
         if value is None or (isinstance(value, float) and math.isnan(value)):
             return "–"
         if isinstance(value, Interval):
@@ -135,18 +135,18 @@ class Table:
 
     @classmethod
     def of(cls, title: str, columns: Sequence[Column], results: Iterable[Row], note: str = "") -> Table:
-        """A row per result."""
+        """Return a row per result."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], note)
 
     def without(self, *names: str) -> Table:
-        """The same but for some columns."""
+        """Return the same but for some columns."""
         kept = [i for i, column in enumerate(self.columns) if column.name not in names]
         rows = [[row[i] for i in kept] for row in self.rows]
         return Table(self.title, [self.columns[i] for i in kept], rows, self.note)
 
     @staticmethod
     def key(value: Any) -> str:
-        """What a cell is sorted by."""
+        """Return what a cell is sorted by."""
         value = getattr(value, "value", value)
         return "" if value is None else str(value)
 
@@ -163,7 +163,7 @@ class Table:
         return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
 
     def markdown(self) -> str:
-        """A Markdown table under its title."""
+        """Return a Markdown table under its title."""
         cells = [
             # A bar inside a cell would end it.
             [column.text(value).replace("|", "\\|") for column, value in zip(self.columns, row, strict=True)]

@@ -24,7 +24,7 @@ SIZE = Column("Gaussians", "d", of="gaussians")
 
 
 def accuracy(figure: str, note: str = "") -> Column:
-    """A test figure, with its interval."""
+    """Return a test figure, with its interval."""
     return Column(heading_of(figure), form_of(figure), note, partial(interval, figure=figure))
 
 
@@ -112,7 +112,7 @@ def costs(runs: Sequence[Run]) -> Table:
 
 
 def worst(runs: Sequence[Run]) -> Table:
-    """The three test positions with the largest error of each run."""
+    """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
     numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]
     columns = [SETTING, SEED, Column("sample"), Column("where [m]"), *numbers]
@@ -137,7 +137,7 @@ MINUTES = (1, 2, 5, 10)
 
 
 def within_minutes(runs: Sequence[Run]) -> Table:
-    """The best validation figure reached within fixed training times, and the time to fixed figures."""
+    """Return the best validation figures within fixed training times, and the times to fixed figures."""
     figure = validation_figure(runs[0])
     score = partial(score_of, figure)
 
@@ -167,7 +167,7 @@ def within_minutes(runs: Sequence[Run]) -> Table:
 
 
 def validation_figure(run: Run) -> str:
-    """The figure of a learning curve: validation of channels and powers logs the mean squared error."""
+    """Return the figure of a learning curve: of channels and powers the mean squared error."""
     return "psnr_db" if run.row["kind"] == "spectrum" else "mse"
 
 

@@ -201,7 +201,7 @@ def fitted(
 
 
 def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
-    """Of the first antennas at places (B, 3) [m, world]; None where the model is not made of paths."""
+    """Return paths of the first antennas at places (B, 3) [m, world]; None of a model without paths."""
     try:
         paths = predictor.paths(**{predictor.site.moving_end: place})
     except ValueError:

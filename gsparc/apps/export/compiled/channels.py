@@ -19,7 +19,7 @@ BEYOND = 1e6  # [m], a place that is near none
 
 
 def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
-    """Of an ensemble's sources without clutter, whose gains `query` has."""
+    """Return the form of an ensemble's sources without clutter, whose gains `query` has."""
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(query.sources), len(query.places)
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES

@@ -59,8 +59,8 @@ SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
 def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled:
-    """The form of a model of one station; its error is measured at `count` random places, and a quarter more
-    near the other end, where powers are largest.
+    """Return the form of a model of one station, its error measured at `count` random places, and a quarter
+    more near the other end, where powers are largest.
 
     Raises:
         ValueError: no form answers as this model does, or it is of several stations.
@@ -105,7 +105,7 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 
 
 def exact_form(method: Method, site: Site) -> Form | None:
-    """The form whose answers are the model's but for rounding; None where there is none."""
+    """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
         return None if method.only is None else exact_form(method.only, site)
     # The process beside sources has no form: where it has no share, the sources are the model.
@@ -141,7 +141,7 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
 
 
 def distilled_form(predictor: Predictor, seed: int) -> Form:
-    """A form near a model: its array's part alone, or a process given its answers at random places.
+    """Return a form near a model: its array's part alone, or a process given its answers at random places.
 
     Raises:
         ValueError: channels that are not made of sources.
@@ -219,7 +219,7 @@ def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
-    """The model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
+    """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
     site = predictor.site
     parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
     asked = [{end: at + site.origin for end, at in part.items()} for part in parts]

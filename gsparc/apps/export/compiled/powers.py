@@ -21,7 +21,7 @@ LANES = 8
 
 
 def powers_form(process: PowerProcess, scale: float) -> Form | None:
-    """The form of a process; None where its terms are others than compiled.
+    """Return the form of a process; None where its terms are others than compiled.
 
     Args:
         process: given its rows.

@@ -17,7 +17,7 @@ ACTIVATIONS = {"linear": 0, "sigmoid": 1, "softplus": 2}
 
 
 def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
-    """Of an array's field; None where its emissions are no process of places."""
+    """Return the form of an array's field; None where its emissions are no process of places."""
     encoding = model.emission.encoding
     if frozen.weights is None or frozen.offset is None or not model.tells_unknown:
         return None
@@ -36,7 +36,7 @@ def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
 
 
 def view_form(frozen: FrozenView) -> Form | None:
-    """Of Gaussians before a static receiver; None where emissions are networks of other than similarities."""
+    """Return the form of Gaussians before a static receiver; None of networks of other than similarities."""
     model = frozen.visible
     emission, encoding, attenuation = model.emission, model.emission.encoding, model.settings.attenuation
     settings = emission.settings
@@ -65,7 +65,7 @@ def view_form(frozen: FrozenView) -> Form | None:
 
 
 def process_form(process: GaussianProcess) -> Form | None:
-    """Of a process on whole spectra given its rows: images of its components, none left out."""
+    """Return the form of a process on whole spectra given its rows: images of all its components."""
     scores = process.scores
     if not isinstance(scores, Exact) or scores.prior.trend is not None:
         return None
