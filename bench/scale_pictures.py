@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 
 from gsparc.evaluation.drawing import logarithmic, look, panels, save
 
-# Exact methods cost count^3: their slope would tilt that of what follows.
 MANY = 10_000  # rows from which slopes are taken: fewer are of exact methods, or too quick to time
 FIT, QUERY = ("fit_cpu_s", "processor seconds of a fit"), ("query_cpu_ms", "processor ms of one query")
 PANELS = {

@@ -96,6 +96,7 @@ class Adaptation:
         self.abstraction = PHYAbstraction()
         self.bler_target = bler_target
         self.subcarriers, self.symbols_per_s = subcarriers, symbols_per_s
+        # 28: table 6.1.4.1-1 of TS 38.214, which Sionna takes for PUSCH; 28 to 31 are for retransmissions.
         order, rate = decode_mcs_index(torch.arange(28), table_index=1, is_pusch=True)
         efficiency = (order.double() * rate.double()).cpu()
         self.full_bps = efficiency * subcarriers * symbols_per_s

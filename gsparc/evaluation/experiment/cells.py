@@ -114,7 +114,7 @@ def plan(
 
     able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
     chosen: list[tuple[Problem, Contender, float | None, int | None]] = []
-    # Methods without a budget are fitted in seconds: they fill a column of every table first.
+    # Methods without a budget first: they stand in the tables of all budgets.
     chosen += [(problem, m, None, None) for problem, those in able for m in those if not m.budget]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
