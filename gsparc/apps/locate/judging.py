@@ -142,7 +142,7 @@ def by_model(
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Unknown(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
-    # What was learned earlier counts only where the settings are the same.
+    # What was learned earlier for other settings is refused: its areas would hold another share.
     start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
     east_north = data.site.origin[:2]

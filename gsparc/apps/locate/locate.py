@@ -59,7 +59,6 @@ def _locator(
     """Of world places (m, 3); None: of the box of the measured ones."""
     site = predictor.site
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
-    # Only what was learned for the same unknowns and share.
     trust = restored(predictor.extra, unknown, share)
     cells = cover(local, MOST, places is not None)
     return Locator(SiteField(predictor), cells, unknown, trust, share)

@@ -78,7 +78,7 @@ class Prepared:
     @property
     def expected_s(self) -> float:
         """Seconds it will take: its budget on every fold, and something for scoring [s]."""
-        # Two seconds for loading and scoring a fold: only the time left that is shown depends on it.
+        # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
         return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
     def result(self) -> Filled | None:
@@ -134,8 +134,8 @@ def fill_all(
     there = [one.result() for one in prepared]
     found = {str(one.cell): one for one in there if one is not None}
     missing = [one for one in prepared if str(one.cell) not in found]
-    # monotonic: setting the machine's clock ends no comparison.
     log.info("%d cells, %d already done", len(prepared), len(found))
+    # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 
     def fits(one: Prepared) -> bool:

@@ -109,10 +109,10 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     known = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in given().items():
+        # Prefixes end at a dot, else `trainer` would count `trainer_x`.
         judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
         if judged and not reads.heeds(path):
             why[_instead(path, method, reads, data)].append(text)
-    # Prefixes end at a dot, else `trainer` would count `trainer_x`.
     words = "; ".join(f"{', '.join(one)} ({text})" for text, one in why.items())
     if why or _alone(method):
         log.warning("%s", f"options without effect here: {words}" if why else ALONE)

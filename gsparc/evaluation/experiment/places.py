@@ -66,7 +66,7 @@ def compare_places(
         rows += _rows(names, facts)
     if not rows:
         raise ValueError("task=locate: no cell keeps a model that states a variance")
-    # Cells of several seeds and draws follow one another: the first of each method is located.
+    # Cells of several seeds and draws follow one another: the first of each method stays.
     errors = pd.DataFrame(rows, columns=[*NAMES, *FIGURES]).drop_duplicates(NAMES)
     return errors.sort_values(["dataset", "split", "median_m"], ignore_index=True)
 

@@ -55,9 +55,9 @@ class Condition:
         return self.what not in ("none", "query")
 
     @property
-    # A query's error changes nothing that is learned: one training serves all of them.
     def learned(self) -> Condition:
         """The condition whose training stands for this one's."""
+        # A query's error changes nothing that is learned: one training serves all of them.
         return self if self.changes_training else Condition()
 
     def model(self, folder: Path) -> Path:
@@ -367,7 +367,7 @@ def thinned(fold: Fold, keep: float, seed: int) -> Fold:
     every = len(fold.train) + len(fold.val)
     # `keep` up to 1 is a share, above it a number of rows; never more than there are.
     total = min(round(keep * every if keep <= 1 else keep), every)
-    # At least one validation row, or nothing could decide when to stop.
+    # One validation row at least, where there is one: it decides when to stop.
     validate = min(max(round(total * len(fold.val) / every), 1), len(fold.val))
     # 4 keeps this draw apart from others of the same seed.
     rng = np.random.default_rng([seed, 4])
