@@ -43,7 +43,7 @@ def gain(true: Tensor, predicted: Tensor) -> Tensor:
 
 
 def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
-    """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN where it is 0."""
+    """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN of silence."""
     best = gain(true, true)
     # Largest of both: a beam into a null would be infinitely bad.
     return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))

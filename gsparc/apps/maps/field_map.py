@@ -82,7 +82,7 @@ class FieldMap:
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
     def strongest(self, layers: np.ndarray) -> np.ndarray:
-        """Return that of layers (T, ny, nx) of each cell's strongest station (ny, nx); NaN where refused."""
+        """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx); NaN where refused."""
         number = np.maximum(self.best_server, 0).astype(np.int64)
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)

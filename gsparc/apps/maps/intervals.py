@@ -173,7 +173,7 @@ def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Return of values (n,) with masses (n,) those below which shares lie; of equal ones as `np.quantile`."""
+    """Return values, of (n,) with masses (n,), below which shares lie; of equal ones as `np.quantile`."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(mass[order]) - mass[order]
     return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])

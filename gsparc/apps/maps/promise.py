@@ -129,7 +129,7 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
 
 
 def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
-    """Return evidence of a fold's test rows, by the `method` fitted to it; `block` (n,): of one held out."""
+    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
     level, side = measured(data, rows)
