@@ -111,6 +111,7 @@ class Group(At):
         """At most so many rows, drawn evenly."""
         if len(self) <= rows:
             return self
+        # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
         index = np.random.default_rng(0).permutation(len(self))[: int(rows)]
         return self.take(torch.from_numpy(np.sort(index)))
 
@@ -119,6 +120,7 @@ class Group(At):
 
     def state(self, factors: Tensor) -> dict[str, Any]:
         """What `read` reads; targets as measured, of runs of these factors."""
+        # Groups hold aligned targets, and `aligned` divides by the factors again when they are read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 
@@ -187,12 +189,14 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
     zero, every = torch.zeros(3, dtype=torch.float64), tuple(range(antennas))
     if not apart:
         return [Slot(station, every, tuple(range(tones)), centre, zero, 2 * math.pi * carrier / LIGHT)]
+    # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
     elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, zero)]
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
+        # Antennas of a moving receiver are offsets in its frame, those of a static one are static ends.
         moves = site.static_end == "tx"
         both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
@@ -205,6 +209,7 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
 
 def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
     """Tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
@@ -243,6 +248,7 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     if site.stations is None:
         return moving, static, turned, torch.zeros(count, dtype=torch.long)
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
+    # NaN would be the minimum: stations at unknown places are infinitely far instead.
     away, nearest = torch.cdist(static, known).nan_to_num(math.inf).min(1)
     lost = known.isnan().any(1)  # an end at an unknown place is the first station at one
     here = static.isnan().any(1) & lost.any()
@@ -285,6 +291,7 @@ def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
     for group, given in known:
         count, outputs = given.values.shape
         nll += outputs * (count * math.log(max(given.scale, 1e-300)) + float(given.factor.log_determinant))
+        # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
 
@@ -293,10 +300,12 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
+        # In units of its own power, as groups have scales of their own.
         own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
+    # `aligning` tells what rows are to be multiplied by, the inverse of what they were.
     estimates[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
     measured = torch.from_numpy(estimates)
     return measured / measured.abs() if ends_of(groups) > 1 else measured

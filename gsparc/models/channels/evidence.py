@@ -95,6 +95,7 @@ def parameters(prior: ChannelPrior) -> Tensor:
 
 def normalised(group: Group) -> Group:
     """The same with targets of unit mean square."""
+    # A silent group stays 0 instead of 0 / 0.
     level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
     return replace(group, target=group.target / level)
 
@@ -107,6 +108,7 @@ def compressed(
     `cache` keeps matrices of places that further candidates and groups need again.
     """
     cache, parts = {} if cache is None else cache, []
+    # Relative to the diffuse field: eigenvalues of its correlation far below are lost in the noise.
     noise = prior.noise / float(prior[Isotropic].power)
     for group in groups:
         key = group.displacements, group.slot.wavenumber, prior.frame.envelope, noise
@@ -121,6 +123,7 @@ def compressed(
 def without(part: Compressed, left: Tensor) -> Compressed:
     """The rows but those of `left` (n,) bool, from the same matrices."""
     rest = torch.nonzero(~left).flatten()
+    # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
     pieces = tuple(piece.within(mixed) for piece in part.pieces)
     return Compressed.of(part.group.take(rest), basis, pieces, part.design)
@@ -136,6 +139,7 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     covariance.diagonal().add_(noise)
     given = Conditioned.of(covariance, part.target)
     count, outputs = part.group.target.shape
+    # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
     quadratic = given.scale * part.target.numel() + part.rest / noise
     scale = max(quadratic / (count * outputs), 1e-300)
     determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
@@ -148,6 +152,7 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     weights = at.given.weights
     weight = at.given.factor.inverse.addmm(weights, weights.mH, beta=outputs, alpha=-1 / at.scale)
     noise = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[-1]
+    # Slope of `rest / (scale noise)`, the quadratic form outside the basis.
     noise = noise - part.rest / (at.scale * power[-1] ** 2)
     return torch.cat([*(piece.traces(weight) for piece in part.pieces), noise[None]]) * power
 
@@ -201,7 +206,7 @@ def minimised(
     start: Tensor,
     bounds: list[tuple[float, float]],
     steps: int,
-    settled: float = 1e7 * torch.finfo(torch.float64).eps,
+    settled: float = 1e7 * torch.finfo(torch.float64).eps,  # SciPy's own default of `ftol`
 ) -> tuple[Tensor, float]:
     """Where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
 
@@ -223,6 +228,7 @@ def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list
     """
     at, noise, wide = solved(part, power), power[-1], part.basis.to(torch.complex128)
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
+    # The inverse is that of the covariance in the basis, and 1 / noise on what is orthogonal to it.
     outside = torch.eye(len(wide), dtype=torch.float64) - part.basis @ part.basis.T
     inverse = wide @ at.given.factor.inverse @ wide.mH + outside / noise
     return [left_out_rows(inverse, alpha, groups)[0] for groups in groupings]
