@@ -30,6 +30,7 @@ from gsparc.processes.conditioned import Conditioned
 
 def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
     """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
     covariance.diagonal().add_(noise + JITTER * level)
     return Conditioned.of(covariance, target)
@@ -49,6 +50,7 @@ class CircularGains:
 
     def add(self, scaled: Tensor, correlation: Tensor) -> None:
         """Add one source, `(s a)(s a)^H * C`."""
+        # With a = p + j q: a a^H = (p p^T + q q^T) + j (q p^T - p q^T).
         pair = torch.stack([scaled.real, scaled.imag], 1)
         turned = torch.stack([scaled.imag, -scaled.real], 1)
         self._real.addcmul_(correlation, pair @ pair.T)
@@ -56,6 +58,7 @@ class CircularGains:
 
     def given(self, noise: Tensor | float) -> Conditioned:
         """The rows' targets given the covariance with noise of this variance."""
+        # In place and for good: `Posterior.conditioned` calls it once.
         self._real.diagonal().add_(noise)
         return Conditioned.of(self.matrix, self.target)
 
@@ -124,12 +127,14 @@ class PhasedGains(CircularGains):
 
     def by_noise(self, slope: Tensor) -> Tensor:
         """See `CircularGains`."""
+        # Half of the noise is in either part, and of real values d nll is half of trace(G dK).
         return slope.diagonal().sum() / 4
 
     def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """See `CircularGains`; differentiable in `quadrature`."""
         n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
         along, across = ((slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stacked(scaled))
+        # Half, as d nll of real values is half of trace(G dK) (`Conditioned.slope`).
         return ((1 - share) * along + share * across) / 2
 
 
@@ -166,6 +171,7 @@ class Posterior:
     @property
     def covariance(self) -> Tensor:
         """Of the rows, noise included."""
+        # The noise is added to the sums when they are first conditioned.
         assert self.conditioned
         return self.summed.matrix
 
@@ -205,6 +211,7 @@ class Posterior:
         n = len(self.rows)
         order = torch.argsort(self.rows.receiver, stable=True)
         counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
+        # Both parts of a receiver's rows: either one alone would tell the other.
         groups = (torch.cat([group, group + n]) for group in order.split(counts.tolist()))
         error, _ = self.conditioned.left_out(groups)
         return self.rows.target - torch.complex(error[:n], error[n:])
@@ -213,6 +220,7 @@ class Posterior:
 def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
     """The scene with the phases of each source's mean gain under the circular process, and a noise floor."""
     posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
+    # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
     one = rows.target.shape[1] == 1
     return replace(scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor)

@@ -91,6 +91,7 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
     if array is not None:
         moving = position[:, None].expand(-1, len(array), -1)
         return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
+    # Antennas of a static receiver without a known array are outputs at the transmitter's place.
     return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
 
 
@@ -115,6 +116,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
         index = index[np.sort(rng.permutation(len(index))[:limit])]
     places = measured_places(data, index).numpy()
     per = places.shape[1]
+    # Antennas first, tones from what is left of the limit.
     most = min(max(limit // max(len(index), 1), 1), per)
     wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
     parts = []
@@ -122,11 +124,13 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
         values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
+            # Antennas of unknown places are outputs of one row, so that a tone must be measured at all.
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:
                 continue
             comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
+            # Of six numbers the last three are the static end's antenna, which `element` names.
             at, target = np.repeat(place[e, None, :3], count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T
             parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
@@ -150,6 +154,7 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
         turned: (K, 3, 3), see `mirror_planes.orientations`.
     """
     if places.shape[1] > 3:
+        # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
     return ranges(places[:, :3], sources)
 

@@ -49,6 +49,7 @@ class Residual:
         self.share = self._constant(constant, scene.quadrature)
         self.root = self._own.root
         self.white = self.root @ self.target
+        # Two matrices (2 n, 2 n) go; the root is all that is asked from here on.
         del self._cached, self._own
 
     def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
@@ -62,6 +63,7 @@ class Residual:
         """Constant share and noise by likelihood, in turn on a grid."""
         columns = stacked(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
         kernel, noise = scene.visibility, scene.log_noise
+        # The nearest on the grid, from which steps go either way.
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
         def cost(constant: float, noise: float) -> float:
@@ -71,6 +73,7 @@ class Residual:
             return _cost(whitened, white, self._determinant).item()
 
         best = cost(constant, noise)
+        # Twice: the likeliest noise moves with the constant share, and the share with it.
         for _ in range(2):
             place = CONSTANTS.index(constant)
             for direction in (-1, 1):
@@ -85,6 +88,7 @@ class Residual:
     def _factor(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
+        # Half of the variance in the real parts, half in the imaginary ones.
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
         self._own = Factor.of(covariance)
         self._determinant = 0.5 * float(self._own.log_determinant)
@@ -111,6 +115,7 @@ class Residual:
         inner, seen = _inner(columns, self.white)
         inverse = Factor.of(inner).inverse
         mean, spread = inverse @ seen, inverse.diagonal()
+        # Savage-Dickey ratio of a unit normal weight, log p(0 | y) / p(0), negated.
         return (0.5 * (mean.square() / spread + spread.log())).float()
 
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
@@ -164,6 +169,7 @@ class CandidateScorer:
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
+        # A change that the constant parts take up almost wholly has no size of its own.
         multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
         return multiple * matched / 2, multiple
 
