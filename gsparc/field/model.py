@@ -57,9 +57,9 @@ class RasterSettings:
     """
 
     projection: Projection = "tangent"
-    low_pass: float = 0.3
+    low_pass: float = 0.3  # [px^2], as in 3D Gaussian splatting (Kerbl et al. 2023)
     compensate: bool = True
-    alpha_cutoff: float = 1 / 255
+    alpha_cutoff: float = 1 / 255  # the least 8-bit step (Kerbl et al. 2023)
     relative_cutoff: float = 1e-3
     backend: str | None = None
 
@@ -141,7 +141,9 @@ class GaussianModel(nn.Module):
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())
         law = settings.attenuation
+        # A static end within 10 cm of the box's middle is no scale of distances.
         self.d_ref = law.d_ref or (apart if apart and apart > 0.1 else 1.0)
+        # Without the law the gain is a parameter all the same, so that state dicts have one shape.
         law = law if law.inverse_distance else AttenuationSettings()
         self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
         self.response = self._response(*(shape or (1, 1)), transmitter)

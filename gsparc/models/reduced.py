@@ -74,6 +74,7 @@ def combinations(
     if "stride" in axes:
         axes["stride"] = _dividing(axes["stride"], method)
     together = [
+        # A setting as trained changes nothing: dropped, so that equal combinations are seen to be equal.
         {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
         for chosen in product(*axes.values())
     ]
@@ -92,6 +93,7 @@ def _dividing(strides: Sequence[int], method: Method) -> list[int]:
     if len(fitting) < len(strides):
         none = ", ".join(str(stride) for stride in strides if stride not in fitting)
         log.warning("stride=%s: does not divide the %d columns of the grid, left out", none, grid.width)
+    # An empty axis would leave no combination at all.
     return fitting or [1]
 
 
@@ -125,6 +127,7 @@ class View(Method):
         """Refused: `TypeError`."""
         raise TypeError("a view of a trained method is neither trained nor stored")
 
+    # Refused as well: what is stored is the whole method.
     state = restore = fit
 
 
@@ -175,6 +178,7 @@ class Filled(View):
         self._height = grid.height
         self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
         self._next = torch.arange(1, width + 1)
+        # Across the seam of a full circle the first column follows the last.
         self._next[-1] = 0 if grid.periodic else width - 1
         self._between = torch.arange(stride) / stride
 
@@ -187,9 +191,11 @@ class Filled(View):
     def fill(self, image: Tensor) -> Tensor:
         """(B, h, w) -> (B, H, W)."""
         beside = image.index_select(2, self._next)
+        # (B, h, w, stride): flattened, the pixels filled in stand between their two columns.
         wide = torch.lerp(image[..., None], beside[..., None], self._between).flatten(2)
         below = wide.index_select(1, self._below)
         tall = torch.lerp(wide[:, :, None], below[:, :, None], self._between[:, None])
+        # A height that the stride does not divide ends within the last step.
         return tall.flatten(1, 2)[:, : self._height]
 
 

@@ -26,12 +26,12 @@ from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 from gsparc.training.time_budget import TimeBudget
 
-FOLDS = 5
+FOLDS = 5  # of squares; each solution is blind to one
 SIDES = 8  # squares along the longer side
 BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
-MOST_ROWS = 3_000
+MOST_ROWS = 3_000  # of one least-squares problem per solution
 ROWS_PER_WAVE = 6  # two real unknowns each
 BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
 
@@ -53,6 +53,7 @@ class Blend:
     def at(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
         """Shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
+        # Linear between the two distances that were measured, constant beyond either.
         there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
         inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
@@ -195,6 +196,7 @@ def find_fringes(
     fringes: Fringes | None = None
     gain: Gain | None = None
     while len(weights) < budget.effort.fringes and not budget.over():
+        # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))
@@ -226,6 +228,7 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     number, every = counts.sum(1), len(blind)
     mean = (powers * counts).sum(1) / number
     spread = ((powers - mean[:, None]) ** 2 * counts).sum(1) / np.maximum(number - 1, 1)
+    # Errors of solutions are independent: the mean of m has variance s^2 / m.
     return spread * (1 / number - 1 / every)
 
 
@@ -235,6 +238,7 @@ def _apart(rows: Rows, fold: np.ndarray, process: PowerProcess) -> tuple[np.ndar
     assert isinstance(exact, Exact)
     inverse, weights = exact.factor.inverse, exact.weights[:, :1]
     probes, distance = fold < 0, np.zeros(len(fold))
+    # `left_out` is measured less predicted, errors here are predicted less measured.
     error = np.where(probes, -left_out(inverse, weights)[0][:, 0].numpy(), 0.0)
     distance[probes] = nearest(rows.places)[probes]
     for k in range(FOLDS):
@@ -250,11 +254,13 @@ def _blend(
 ) -> tuple[Blend, Gain]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
+    # From the process's prediction, measured plus error, to that of the solutions.
     towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
     excess = _excess_variance(powers, fold, blind)
     shares, left = [], []
     for chosen in (probes, ~probes):
         share = _share(error[chosen], towards[chosen], excess[chosen], group[chosen])
+        # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
         left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
@@ -273,6 +279,7 @@ def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np
     alike = len(group) / len(np.unique(group))
     noise = alike * max(float((error**2).mean()), 1e-12)
     square = max(float(towards @ towards - excess.sum()), 0.0)
+    # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
     certain = 1 / SPREAD**2
     return float(
         np.clip((-(towards @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)
