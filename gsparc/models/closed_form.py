@@ -89,6 +89,7 @@ def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
     Raises:
         ValueError: it names what is no such method of gsparc or a plugin.
     """
+    # The class is named by a file: only gsparc's and plugins' are imported.
     refuse_foreign(state["target"])
     kind = find(state["target"])
     if not issubclass(kind, ClosedForm):

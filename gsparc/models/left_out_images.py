@@ -51,6 +51,7 @@ class LeftOut:
         """The same samples (g, c, P) as a Gaussian process on images predicts them from what is left."""
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
+        # Left singular vectors times singular values are scores in an orthonormal basis.
         kernel = choose_kernel(self.positions, vectors * lengths, len(mean))
         inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
@@ -70,9 +71,11 @@ class LeftOut:
         if distance is None:
             return 0
         apart = cdist(self.positions[self.centres], self.positions)
+        # A row is not its own neighbour.
         apart[np.arange(len(apart)), self.centres] = np.inf
         beyond = [np.where(apart > gap, apart, np.inf).min(1) for gap in self.gaps]
         medians = np.array([np.median(nearest) for nearest in beyond])
+        # By ratio: twice as far and half as far are equally wrong.
         return int(np.argmin(np.abs(np.log(medians + 1e-9) - np.log(distance + 1e-9))))
 
 
@@ -100,6 +103,7 @@ def predict_left_out(
     for g, gap in enumerate(gaps):
         near = distance[centres] <= gap
         near[np.arange(len(centres)), centres] = True
+        # Rows with all others inside the gap have nothing to be predicted from: they stay NaN.
         some = np.flatnonzero(~near.all(1))
         result = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
         mean[g, some], variance[g, some] = values[centres[some]] - result[0].numpy(), result[1].numpy()

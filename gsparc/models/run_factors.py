@@ -16,8 +16,8 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Prediction
 
-SWEEPS = 200
-SETTLED = 1e-9
+SWEEPS = 200  # of all factors in turn, at most
+SETTLED = 1e-9  # largest change of a factor, of the largest factor, at which they end
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
         for r in range(len(size)):
             others = own[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
+            # Positive root of own x^2 - pull x - power size = 0, the likelihood's slope by a factor's size.
             length = (pull + np.sqrt(pull**2 + 4 * own[r] * power * size[r])) / max(2 * own[r], 1e-300)
             factors[r] = length * (others / pull if pull > 0 else 1.0)
         if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():

@@ -68,6 +68,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
         rows -= means[-1]
         gram += rows @ rows.T
         energy += float((rows**2).sum())
+    # n centred rows span n - 1 directions.
     keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
     values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
     solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
@@ -77,6 +78,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
     axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
+    # A small difference of large sums may round below 0.
     lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
@@ -90,6 +92,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
         entries: real numbers per target, P or more.
     """
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+    # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
         return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
@@ -150,6 +153,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
+        # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
         start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
@@ -196,6 +200,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         assert self.scores is not None
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._composed(result.mean, dtype)
+        # What the components leave out is an error of every prediction.
         variance = (kernel.amplitude * result.left + self.lost).to(dtype)
         unknown = (result.left / (1 + kernel.noise)).to(dtype)
         return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
@@ -289,6 +294,7 @@ def kernel_given_nearest(
     """
     row = covering(places, LOOKED_AT, seed)
     near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
+    # A row need not come first among its neighbours, as others may lie at its place.
     own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
     rows = np.c_[row, np.take_along_axis(near, own, 1)]
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]

@@ -45,8 +45,10 @@ class Interpolator(Method):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = TimeBudget()
+        # Before learning, which asks for the kind and shape of targets.
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         places, targets, side = data.moving[rows], training_targets(data, rows), data.side(rows)
+        # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
         before = set(vars(self))
         if self.uses_censored and side.any():
             notes = self._learn_censored(places, targets, side)
@@ -68,6 +70,7 @@ class Interpolator(Method):
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
+        # NumPy has no autograd: methods with gradients are `Differentiable`.
         return self._look_up(queries.detach().numpy())
 
     def state(self) -> dict[str, Any]:

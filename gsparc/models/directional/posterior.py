@@ -144,6 +144,7 @@ class SightedSources:
     def learned(self) -> SightedSources:
         """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
+        # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
         coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
         for _ in range(ROUNDS):
@@ -157,6 +158,7 @@ class SightedSources:
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
             known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
+            # A power of 0 would stay 0 for ever: every update is proportional to it.
             power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
         return replace(self, power=power, kernel=kernel)
 
@@ -191,6 +193,7 @@ class SightedSources:
         powers = arriving.abs().square() * self.power
         cross = self._cross(arriving * probability, at.retained, self.power) * at.correlation
         gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
+        # Variance p (1 - p) of a source that is seen or not, times its power.
         of_visibility = (powers * probability * (1 - probability)).sum(1)
         return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise
 
@@ -201,6 +204,7 @@ class SightedSources:
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in groups_of(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
             predicted[group] -= cross[group] @ (inverse[:, group] @ own)
         return predicted
 
@@ -213,6 +217,7 @@ class SightedSources:
     def _cross(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
         """Covariance (m, n) of waves (m, K) with the rows, before the correlation over places."""
         uncertain = self.uncertain
+        # Certain sources together in one product; each uncertain one has a coherence of its own.
         exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
         total = (waves * exact) @ self.waves.mH
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):

@@ -65,6 +65,7 @@ class Frame:
         """
         rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
         position = query.rx.position if self.site.moving_end == "rx" else query.tx
+        # float64: phases need lengths to a fraction of a wavelength.
         position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
@@ -72,6 +73,7 @@ class Frame:
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
+        # NaN: who needs a variance takes that of a prediction at the place.
         unknown = torch.full((len(predicted),), float("nan"))
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
@@ -113,6 +115,7 @@ class SourcesInFrame(ClosedForm):
         tones = torch.from_numpy(frame.site.tones())
         mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
+        # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
         variance, prior = (each.reshape(count, -1).mean(1) for each in (variance, prior))
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)

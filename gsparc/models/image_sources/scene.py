@@ -57,6 +57,7 @@ class KernelVisibility:
 
     def parameters(self, least: float, *shares: float) -> Tensor:
         """Inverse of `of`, then the logits of more `shares`; all shares are at least `least`."""
+        # A logit has no value at 0 and 1, and hardly a slope near them.
         clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
         return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
@@ -136,6 +137,7 @@ class Scene:
         """
         points, box = self.sources, box_of(rows, self.transmitter)
         inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
+        # Within 10 cm it is the transmitter itself.
         return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
     def images(self, rows: Rows) -> Tensor:
@@ -234,4 +236,5 @@ def _is_wide(places: Tensor, length: float) -> bool:
 
 def _squared(a: Tensor) -> Tensor:
     length = a.square().sum(-1)
+    # The sum cancels for near places, and rounds below 0.
     return (length[:, None] + length[None] - 2 * a @ a.T).clamp_min(0)

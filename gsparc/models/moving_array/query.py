@@ -89,6 +89,7 @@ class Images:
         self, array: Array, basis: Separable, trends: Sequence[Trend], residual: Residual, places: Tensor
     ) -> None:
         self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
+        # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
 
@@ -99,6 +100,7 @@ class Images:
         images = [self._array.render(t.sources, receivers, t.powers(far)) for t in self._trends]
         explained = images[0] if len(images) == 1 else torch.stack(images).mean(0)
         added = self._residual.coefficients(far)
+        # In place into fresh images: another copy would be as large as the answer.
         return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
 
     @cached_property

@@ -68,6 +68,7 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
         array = "with" if start == "vectors" else "without"
         raise ValueError(f"init={start} needs {needed}, {array} effects.array; here {why}")
     started = start in ("images", "vectors")
+    # Channels are signed, powers have no ceiling, pixels lie in [0, 1]; solved weights are linear.
     fitting = {"csi": "linear", "rssi": "softplus", "spectrum": "linear" if started else "sigmoid"}
     reason = "a closed-form start" if started else f"the target is {site.kind}"
     if through_array:
@@ -81,6 +82,7 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
         bias = 0.0
         if site.kind == "rssi" and activation == "softplus":
             count = max(settings.field.count, 1)
+            # Inverse of softplus, at 1 / count.
             bias = math.log(math.expm1(1 / count))
             notes.append(f"init_bias=auto -> {bias:.2f}: {count} Gaussians add up to unit power")
     return Choices(start, encoding, activation, float(bias)), tuple(notes)

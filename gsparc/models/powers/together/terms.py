@@ -56,6 +56,7 @@ class LinkRows(Rows):
         """
         _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
         place = place.reshape(-1)
+        # One rank for a place: stations that share places keep the same ones.
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
         chosen = []
         for number in self.stations:
@@ -132,6 +133,7 @@ class Terms:
             return places.new_zeros(len(places), 0)  # each site has its own
         decades = _decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
+        # Beyond what was heard the parabola goes on as its tangent.
         bend = inside.square() + 2 * inside * (decades - inside)
         law = torch.stack([decades, bend], 1) * torch.tensor(LAW_DB, dtype=torch.float64)
         if not self.place_db:
@@ -142,6 +144,7 @@ class Terms:
     @cached_property
     def _factor(self) -> Factor:
         gram = matern32(apart(self.inducing, self.inducing), self.length)
+        # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
         return Factor.of(gram, "raise")
 
