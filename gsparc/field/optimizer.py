@@ -43,6 +43,7 @@ class OptimizerSettings(Checked):
     decay: float = setting(0.05, RATE)
     warmup: int = setting(0, whole(0))
     solved_share: float = setting(0.01, RATE)
+    # As in 3D Gaussian splatting: gradients of single Gaussians are below Adam's usual 1e-8.
     eps: float = internal(1e-15)
 
     def after_closed_form(self, total: int) -> OptimizerSettings:
@@ -99,8 +100,10 @@ def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf
 def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -> float:
     """Rate at `step` as a share of the initial one."""
     progress = min(step / max(total, 1), 1.0)
+    # From one share, as a first step of rate 0 would be lost.
     rise = min((step + 1) / settings.warmup, 1.0) if settings.warmup else 1.0
     if kind == "positions":
+        # Means that are held have no ratio of rates.
         if settings.positions == 0:
             return 0.0
         return rise * (settings.positions_final / settings.positions) ** progress

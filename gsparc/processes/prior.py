@@ -43,6 +43,7 @@ class Prior:
 
     def variance(self, columns: Tensor) -> Tensor:
         """Return the variance of a measurement (n,) at places of terms (n, Q)."""
+        # Weights of columns have unit variance, and so has the kernel.
         return columns.square().sum(1) + (1 + self.kernel.noise)
 
     def state(self) -> dict[str, Any]:

@@ -106,6 +106,7 @@ class FitContext:
             raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
         if self.stations not in get_args(StationModels):
             raise ValueError(f"stations={self.stations!r}: one of auto, each, together is needed")
+        # `isinstance` would take true for 1.
         if type(self.batch_size) is not int or self.batch_size < 1:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
@@ -117,6 +118,7 @@ class FitContext:
             from gsparc.training.tracking import Part  # imports Lightning
 
             changes = {"loggers": [Part(one, folder) for one in self.loggers], **changes}
+        # No folder stays none: below an empty path lies the working directory.
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
     def curve(

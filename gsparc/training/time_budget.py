@@ -108,6 +108,7 @@ class TimeBudget:
         self._since: Spent | None = self._now()
 
     def _now(self) -> Spent:
+        # Seconds of threads add up: divided, both clocks agree where all of them work.
         return Spent(time.monotonic(), time.process_time() / self._threads)
 
     @property
@@ -123,6 +124,7 @@ class TimeBudget:
     @property
     def left_s(self) -> float | None:
         """What is left of it, more than nothing; None without an end [s]."""
+        # Never 0, as a context refuses a budget that is not positive.
         return None if math.isinf(self.seconds) else max(self.seconds - self.spent, 1e-3)
 
     @property
