@@ -66,6 +66,7 @@ def fit(
             start from (`init_from`), and the method has none.
     """
     budget = TimeBudget()
+    # Before the method is made, as another may be called for once rows share a phase.
     (data, rows), left = with_common_phase(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
@@ -73,6 +74,7 @@ def fit(
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             return _restored(factory, data, fold, context, left / checkpoint.MODEL)
+        # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
@@ -192,6 +194,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
         return []
     one, two = dict(leaves(before)), dict(leaves(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
+    # `model.refit` lies under `model`, and may change all the same.
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 

@@ -23,6 +23,7 @@ def restore(stored: checkpoint.Stored) -> Method:
     """
     model = stored.configuration.get("model")
     try:
+        # Of `gsparc` the file names the method that was made, its configuration who made it.
         makers = stored.target, import_path(Gsparc)
         if isinstance(model, dict) and model.get("_target_") in makers:
             factory = build(model, trusted=False)

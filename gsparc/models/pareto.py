@@ -76,6 +76,7 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
         latency: (n,) [ms].
         score: (n,) larger is better.
     """
+    # Of equal latencies the most accurate first: it then beats the others.
     order = sorted(range(len(latency)), key=lambda i: (latency[i], -score[i]))
     best: list[int] = []
     for i in order:

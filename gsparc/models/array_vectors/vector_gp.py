@@ -57,6 +57,7 @@ def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None
     for i in order[1:]:
         near = _nearest_done(tree, positions, i, done, 4)
         distance = np.linalg.norm(positions[near] - positions[i], axis=1)
+        # By distance alone: lengths of the neighbours' vectors are divided out.
         weight = np.exp(-distance / max(distance[0], 1e-6)) / np.maximum(
             np.linalg.norm(aligned[near], axis=1), 1e-12
         )

@@ -56,6 +56,7 @@ def estimate(
         correlation = np.abs(per_tone @ phasor)
         best = correlation.argmax(1)
         before, at, after = (correlation[np.arange(len(best)), (best + s) % DELAYS] for s in (-1, 0, 1))
+        # Negative at a maximum; a flat correlation has no top.
         curvature = np.minimum(before - 2 * at + after, -1e-30)
         delay = tried[best] + 0.5 * (before - after) / curvature * (period / DELAYS)
     phasor = np.exp(2j * np.pi * (frequency_hz - carrier_hz) * delay[:, None])

@@ -70,6 +70,7 @@ def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[st
     own = {name: getattr(init, name) for name in names}
     own["searches"] = max(round(context.effort * init.searches), 1)
     for name in ("search_rows", "rows"):
+        # Factoring a covariance of n rows takes n^3.
         own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
     return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 

@@ -50,6 +50,7 @@ class ComplexGaussians(GaussianNetwork):
         self.grid, self.options = rendering_of(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
         with torch.no_grad():
+            # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
         self.response: nn.Parameter | None = None
         if scene.site.kind == "csi":  # of each Gaussian at every antenna and tone
@@ -61,6 +62,7 @@ class ComplexGaussians(GaussianNetwork):
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
         """Radiance (B, N, 2) of each Gaussian towards the moving end."""
         towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
+        # [m]: 1 / distance grows without end at the moving end itself.
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
         series = fourier_legendre(towards / distance, self.degree, self.order)
         sent = torch.einsum("bnk,nkc->bnc", series, self.coefficients)
@@ -89,6 +91,7 @@ class ComplexGaussians(GaussianNetwork):
         """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
         plain = task_loss(seen, batch, self).mean()
+        # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
         difference = torch.fft.rfft2(seen - batch.target, norm="ortho").abs().mean()

@@ -63,6 +63,7 @@ class PlanarGaussians(GaussianNetwork):
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
+        # A factor of 20 either way: exp of what a network says has no bound.
         widths = (self.log_widths + stretch.clamp(-3, 3)).exp()
         flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
@@ -70,6 +71,7 @@ class PlanarGaussians(GaussianNetwork):
         quats = turned_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
+        # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
         here = Pose(torch.zeros(3), torch.eye(3))
         image = render_each(geometry, strength, here, self.grid, cutoff=CUTOFF, compensate=False)
@@ -124,7 +126,9 @@ def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
     step = torch.arange(count) + 0.5
     bottom, top = math.sin(max(low, -math.pi / 2)), math.sin(min(high, math.pi / 2))
+    # Equal steps of z cut the sphere into equal areas.
     z = bottom + (top - bottom) * step / count
+    # Turns by the golden ratio: a Fibonacci lattice, even at any count.
     turns = torch.remainder(step * (math.sqrt(5) - 1) / 2, 1.0)
     azimuth = grid.first_azimuth + turns * grid.width * grid.azimuth_step
     horizontal = (1 - z**2).clamp_min(0).sqrt()

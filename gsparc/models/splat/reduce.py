@@ -150,6 +150,7 @@ def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
     order = [int(measured["contribution"].argmax())]
     apart = 1 - seen @ seen[order[0]]
     while len(order) < len(seen):
+        # Below every distance, so that what is chosen is not chosen again.
         apart[order[-1]] = -1.0
         order.append(int(apart.argmax()))
         apart = torch.minimum(apart, 1 - seen @ seen[order[-1]])
@@ -174,6 +175,7 @@ def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
     rx, grid = Pose(receiver[0], receiver[1:]), whole.site.grid
     assert grid is not None
     entries = grid.height * grid.width * len(whole.gaussians)
+    # The finest grid whose pixels times Gaussians fit in memory.
     fitting = [s for s in (1, 2, 3, 4, 5) if grid.width % s == 0 and entries <= MOST_WEIGHTS * s**2]
     grid = coarser(grid, fitting[0]) if fitting else grid
     wanted = _weights_of(whole, rx, grid)

@@ -46,6 +46,7 @@ class ReflectionPhasePrior:
         """From a scene's phases, weighted by power."""
         assert scene.phase is not None
         order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
+        # Three phases lie near 0 or pi by chance.
         if len(order) < 4:
             return ReflectionPhasePrior(0.0, 0.0)
         power = scene.log_amplitude.mul(2).exp() * (order > 0)
@@ -53,6 +54,7 @@ class ReflectionPhasePrior:
             (float((power * (phase - phase[0] - order * t).cos()).sum() / power.sum()), t)
             for t in (0.0, math.pi)
         )
+        # At 1 the concentration is infinite.
         share = min(max(share, 0.0), 0.97)
         return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
@@ -79,6 +81,7 @@ def descend(
     start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
+    # Shorter memories than Adam's usual ones, of a thousand steps.
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
@@ -98,6 +101,7 @@ def descend(
         factored = residual.scene
         for value, count in ((planes, len(factored.planes)), (phase, len(factored.sequences))):
             if value.grad is not None:
+                # What the varying part was factored with stays; see the module's text.
                 value.grad[:count] = 0
         optimizer.step()
         for group in optimizer.param_groups:

@@ -145,6 +145,7 @@ class Mirrors:
         self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
     ) -> Tensor:
         """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
+        # [m]: a place at an image would outweigh all others.
         away = torch.cdist(images(transmitter, self.planes, sequences), places).clamp_min(0.1)
         order = torch.tensor([len(sequence) for sequence in sequences])
         power = away.square().reciprocal()
