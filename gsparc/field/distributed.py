@@ -79,6 +79,7 @@ def add_up(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
     every = list(parameters)
     own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
+    # Sent along: a parameter without a gradient in this process may have one in another.
     has = own[0].new_tensor([p.grad is not None for p in every])
     flat = total(torch.cat([has, *(gradient.flatten() for gradient in own)]))
     sums = flat[len(every) :].split([gradient.numel() for gradient in own])

@@ -79,6 +79,7 @@ class Emission(nn.Module):
         encoded = self.encoding(position)
         if not self.settings.hidden:
             count, width, channels = self.weight2.shape
+            # Without hidden units all Gaussians read the same features: one product.
             flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
             return (encoded @ flat).view(len(encoded), count, channels) + self.bias2
         return networks(encoded, self.weight1, self.bias1, self.weight2, self.bias2)
@@ -98,6 +99,7 @@ class Emission(nn.Module):
             return emission
         if self.settings.activation == "softplus":
             positive = emission.clamp_min(EMISSION_FLOOR)
+            # log(e^x - 1), without its overflow.
             return positive + torch.log(-torch.expm1(-positive))
         logits = torch.logit(emission.clamp(EMISSION_FLOOR, 1 - EMISSION_FLOOR))
         return logits + distance.log().unsqueeze(-1) if self.settings.log_distance else logits

@@ -126,6 +126,7 @@ class FitContext:
     ) -> None:
         """Add a point to the learning curve, in the folder and the loggers; see `curve.point`."""
         row = curve.point(seconds, what, error, step, **figures)
+        # All rows again: a file that appears by renaming cannot be appended to.
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)
 

@@ -25,6 +25,7 @@ class Cost:
     def __add__(self, other: Cost) -> Cost:
         """Of two fits, such as those of two stations."""
         stages, unused = (
+            # In the order in which stages came, which a set would lose.
             {name: a.get(name, 0.0) + b.get(name, 0.0) for name in dict.fromkeys([*a, *b])}
             for a, b in ((self.stages, other.stages), (self.unused, other.unused))
         )

@@ -148,10 +148,12 @@ class TimeBudget:
     def moved(self) -> None:
         """Count on in another process, whose processor time began with it."""
         if self._since is not None:
+            # The wall's clock is the machine's; a new process's own begins at 0.
             self._since = Spent(self._since.wall, 0.0)
 
     def over(self) -> bool:
         """Whether it is spent; whoever asks then ends what it does."""
         result = self.spent > self.seconds
+        # For good: what it ended stays ended, though time may be charged or paused later.
         self.limited |= result
         return result
