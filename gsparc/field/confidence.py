@@ -70,7 +70,7 @@ class ErrorModel(nn.Module):
 
 
 def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+    """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
     The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
     line through logarithms would fit the many small errors and miss the few large ones.
@@ -108,7 +108,7 @@ class Confidence(nn.Module):
         self.register_buffer("high", torch.ones(()))
 
     def exponent(self, position: Tensor) -> Tensor:
-        """g (B,), clamped: position (B, 3) [m]."""
+        """Return g (B,), clamped, at positions (B, 3) [m]."""
         g = self.network(self.encoding(position)).squeeze(-1)
         g = g if g.dtype == torch.float64 else g.float()
         return g.clamp(-self.settings.clamp, self.settings.clamp)
@@ -132,7 +132,7 @@ class Confidence(nn.Module):
 
 
 def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
-    """C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
+    """Return C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
 
     log C = log(1 + e^g) is a softplus, finite and with a finite slope for every g.
     """

@@ -40,7 +40,7 @@ class Processes(DDPStrategy):
 
     @classmethod
     def named(cls, strategy: object) -> Processes | None:
-        """The one that `trainer.strategy` means: of `ddp*`; None of others."""
+        """Return the one that `trainer.strategy` means: of `ddp*`; None of others."""
         if not (isinstance(strategy, str) and strategy.startswith("ddp")):
             return None
         return cls("fork" if "fork" in strategy or "notebook" in strategy else "spawn")
@@ -88,7 +88,7 @@ def add_up(parameters: Iterable[Tensor]) -> None:
 
 
 def count() -> int:
-    """How many processes train."""
+    """Return how many processes train."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
@@ -98,12 +98,12 @@ def total(values: Tensor) -> Tensor:
 
 
 def largest(values: Tensor) -> Tensor:
-    """Maximum over processes, in place; the values themselves where there is one."""
+    """Return the maximum over processes, in place; the values themselves where there is one."""
     return _reduced(values, ReduceOp.MAX)
 
 
 def agreed(value: float, trainer: L.Trainer) -> float:
-    """The first process's value: clocks differ, and all must decide alike."""
+    """Return the first process's value: clocks differ, and all must decide alike."""
     if not distributed.is_initialized():
         return value
     shared = torch.tensor(value, dtype=torch.float64, device=trainer.strategy.root_device)

@@ -75,7 +75,7 @@ class Emission(nn.Module):
         self.bias2 = nn.Parameter(torch.full((count, channels), float(settings.init_bias)))
 
     def logits(self, position: Tensor) -> Tensor:
-        """Network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
+        """Return network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
         encoded = self.encoding(position)
         if not self.settings.hidden:
             count, width, channels = self.weight2.shape
@@ -94,7 +94,7 @@ class Emission(nn.Module):
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
     def inverse(self, emission: Tensor, distance: Tensor) -> Tensor:
-        """The logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
+        """Return the logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
         if self.settings.activation == "linear":
             return emission
         if self.settings.activation == "softplus":

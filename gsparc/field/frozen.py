@@ -35,7 +35,7 @@ class FrozenView:
 
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
-        """Spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
+        """Return spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
 
         Raises:
             StalePlan: the field has changed since.
@@ -139,7 +139,7 @@ def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
 
 
 def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
-    """A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
+    """Return A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
 
     Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that antenna by
     emissions, so that the cost grows with footprints and antennas, not with the square of the Gaussians.

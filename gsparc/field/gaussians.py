@@ -73,7 +73,7 @@ class GaussianField(nn.Module):
         return len(self.means)
 
     def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, quaternions, scales and opacities, as the rasterizer takes them."""
+        """Return means, quaternions, scales and opacities, as the rasterizer takes them."""
         return self.means, self.quats, self.scales, self.opacities
 
     @torch.no_grad()
@@ -100,7 +100,7 @@ def initial_field(
     receiver: Tensor | None,
     rotation: Tensor | None,
 ) -> GaussianField:
-    """A field before training.
+    """Return a field before training.
 
     Args:
         settings: size and initial state.

@@ -76,7 +76,7 @@ class KeepBest(L.Callback):
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
-        """What is kept, so that a resumed run ends with it, too."""
+        """Return what is kept, so that a resumed run ends with it, too."""
         counts = {"step": self.step, "looks": self.looks}
         return {"error": self.error, **counts, "start": self.start, "kept": self._kept}
 

@@ -182,21 +182,21 @@ class GaussianModel(nn.Module):
 
     @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
     def features(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
+        """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.distances(tx)
         emitted = self.emission(self.site.moving(tx, rx), distance)
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
     def distances(self, tx: Tensor) -> Tensor:
-        """d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
+        """Return d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
         x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))  # a sum over 3 is slow
         # In place: fresh memory of megabytes costs more than the arithmetic.
         square = (x * x).addcmul_(y, y).addcmul_(z, z).add_(self.settings.attenuation.d_min**2)
         return square.mul_(1 / self.d_ref**2).sqrt_()
 
     def attenuation(self, distance: Tensor) -> Tensor | None:
-        """a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
+        """Return a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
         return self.log_gain.exp() / distance if self.settings.attenuation.inverse_distance else None
 
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
@@ -214,11 +214,11 @@ class GaussianModel(nn.Module):
         return Rendered(self.response(weights * gains), None)
 
     def raster(self, features: Tensor, rx: Pose) -> Raster:
-        """Images of features (B, N, C) from one pose, or each from its own of B."""
+        """Return images of features (B, N, C) from one pose, or each from its own of B."""
         return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._optics())
 
     def plan(self, rx: Pose) -> Plan:
-        """Footprints and depth order from one pose, or from each of B."""
+        """Return footprints and depth order from one pose, or from each of B."""
         return ops.make_plan(*self.gaussians.geometry(), rx, **self._optics())
 
     def _optics(self) -> dict[str, Any]:
@@ -235,6 +235,6 @@ class GaussianModel(nn.Module):
         }
 
     def freeze(self, rx: Pose) -> FrozenPlan:
-        """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
+        """Return the pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
             return ops.freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))

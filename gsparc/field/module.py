@@ -77,7 +77,7 @@ class NetworkModule(L.LightningModule):
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
 
     def mean(self, batch: Batch) -> Tensor:
-        """Targets (B, ...) as predicted."""
+        """Return targets (B, ...) as predicted."""
         return self.model(batch.tx, batch.rx)
 
     def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -88,7 +88,7 @@ class NetworkModule(L.LightningModule):
         return loss, loss.expand(len(batch))
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
-        """Loss of a batch; one that is not finite ends training."""
+        """Return the loss of a batch; one that is not finite ends training."""
         self.batch = batch
         loss, task = self.losses(batch)
         if not torch.isfinite(loss):
@@ -142,7 +142,7 @@ class NetworkModule(L.LightningModule):
         }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
-        """Targets (B, ...) in stored units, spectra within [0, 1]."""
+        """Return targets (B, ...) in stored units, spectra within [0, 1]."""
         mean = self.mean(batch)
         return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
 
@@ -159,7 +159,7 @@ class NetworkModule(L.LightningModule):
         )
 
     def configure_optimizers(self) -> Any:
-        """One Adam group per tensor, rates as pure functions of the step."""
+        """Return one Adam group per tensor, rates as pure functions of the step."""
         optimizer = optimizer_for(self.model, self.rates, self.rate_of)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
@@ -231,7 +231,7 @@ class GaussianModule(NetworkModule):
         return weighted(task, exponent, confidence.settings.alpha).mean(), task
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Loss per sample (B,) before confidence; what was not measured counts as met."""
+        """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
         return task_loss(prediction, batch, self.loss)
 
     def _render(self, batch: Batch) -> Rendered:
@@ -256,7 +256,7 @@ class GaussianModule(NetworkModule):
 
 
 def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:
-    """Squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
+    """Return the squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
     target = batch.target
     if kind == "rssi":
         error = 10 * (mean.clamp_min(1e-30).log10() - target.clamp_min(1e-30).log10())

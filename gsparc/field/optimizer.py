@@ -82,7 +82,7 @@ def kind_of(name: str) -> str:
 
 
 def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf | None = None) -> Adam:
-    """Adam with one parameter tensor per group, so that surgery can exchange single tensors.
+    """Return Adam with one parameter tensor per group, so that surgery can exchange single tensors.
 
     Args:
         model: what is trained.
@@ -98,7 +98,7 @@ def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf
 
 
 def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -> float:
-    """Rate at `step` as a share of the initial one."""
+    """Return the rate at `step` as a share of the initial one."""
     progress = min(step / max(total, 1), 1.0)
     # From one share, as a first step of rate 0 would be lost.
     rise = min((step + 1) / settings.warmup, 1.0) if settings.warmup else 1.0
@@ -111,7 +111,7 @@ def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -
 
 
 def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> LambdaLR:
-    """The schedule of every group over `total` steps."""
+    """Return the schedule of every group over `total` steps."""
 
     def factor(kind: str):
         return lambda step: rate_factor(kind, settings, step, total)

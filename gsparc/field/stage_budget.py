@@ -53,7 +53,7 @@ class Budget(L.Callback):
         trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
 
     def state_dict(self) -> dict[str, Any]:
-        """Seconds spent, so that a resumed run has only the rest."""
+        """Return the seconds spent, so that a resumed run has only the rest."""
         return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

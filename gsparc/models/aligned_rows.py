@@ -141,7 +141,7 @@ _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measuremen
 
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
-    """The better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)

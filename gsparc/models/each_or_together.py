@@ -48,7 +48,7 @@ class LearnsTogether(MethodFactory):
 
 
 def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
-    """How stations of a site that can be learned as one are best learned, and why.
+    """Return how stations of a site that can be learned as one are best learned, and why.
 
     Channels share waves and where their stations really stand: together. Powers share little more than a
     law, so that folds cut as the test was cut decide, between processes without Gaussians.

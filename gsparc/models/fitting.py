@@ -97,7 +97,7 @@ def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext
 
 
 def folder_of(path: Path, parts: str) -> Path:
-    """The folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
+    """Return the folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
     inside = path if path.is_dir() else path.parent
     if any(re.fullmatch(parts, one.name) for one in inside.glob("*")):
         return inside
@@ -117,7 +117,7 @@ def _restored(
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:
-    """Their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
+    """Return their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
     result = Counter(method.label for method in methods)
     if not result:
         return name

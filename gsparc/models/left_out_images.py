@@ -58,7 +58,7 @@ class LeftOut:
         return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
     def at(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions and targets (n, P) at one gap, of the samples that anything is left for."""
+        """Return predictions and targets (n, P) at one gap, of the samples that anything is left for."""
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]
 

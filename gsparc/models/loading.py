@@ -16,7 +16,7 @@ from gsparc.models.splat.method import LearnedField
 
 
 def restore(stored: checkpoint.Stored) -> Method:
-    """The fitted method a checkpoint holds; only classes of gsparc are built.
+    """Return the fitted method a checkpoint holds; only classes of gsparc are built.
 
     Raises:
         CheckpointError: unknown method, or a state that does not fit it.
@@ -53,7 +53,7 @@ def made_again(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
 
 
 def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
-    """`restore(read(path))`, with what else the file holds.
+    """Return `restore(read(path))`, with what else the file holds.
 
     Raises:
         CheckpointError: as these two.

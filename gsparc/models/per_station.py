@@ -54,7 +54,7 @@ def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
 
 
 def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Stations (T,) bool with training rows enough for `method`, and those of test rows without."""
+    """Return stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
@@ -64,7 +64,7 @@ def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> t
 
 
 def of_station(site: Site, number: int) -> Site:
-    """The site as one station sees it; of `UNHEARD`, with both ends moving.
+    """Return the site as one station sees it; of `UNHEARD`, with both ends moving.
 
     Its hash is its own, so that nothing kept of one station is taken for another's.
     """
@@ -249,7 +249,7 @@ class PerStation(Method):
         return next(filter(None, (copy.gradient_problem() for copy in self._copies.values())), None)
 
     def of(self, number: int) -> Method:
-        """The copy that answers for a station.
+        """Return the copy that answers for a station.
 
         Raises:
             ValueError: it had too few training rows, and there is no copy for such stations.
@@ -290,7 +290,7 @@ class PerStation(Method):
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
 
     def state(self) -> dict[str, Any]:
-        """Class and state of every copy, by its station's number."""
+        """Return the class and state of every copy, by its station's number."""
         copies = {
             str(number): {"target": import_path(copy.stored_as), "state": copy.state()}
             for number, copy in self._copies.items()
@@ -305,13 +305,13 @@ class PerStation(Method):
             copy.restore(self._site_of(site, int(number)), part["state"])
 
     def objects(self) -> SiteObjects:
-        """Those of all copies: what stands in a site stands there for all its stations."""
+        """Return those of all copies: what stands in a site stands there for all its stations."""
         return reduce(
             SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
         )
 
     def size(self) -> int:
-        """That of all copies."""
+        """Return that of all copies."""
         return sum(copy.size() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
@@ -333,7 +333,7 @@ class OfStation(View):
         self.number = number
 
     def gradient_problem(self) -> str | None:
-        """That of all stations."""
+        """Return that of all stations."""
         return self.inner.gradient_problem()
 
     def predict(self, query: Query) -> Prediction:
@@ -349,7 +349,7 @@ class OfStations(OfStation):
         self.count = count
 
     def joint(self) -> HasJoint | None:
-        """What knows how levels of stations go together; None where nothing does."""
+        """Return what knows how levels of stations go together; None where nothing does."""
         method = getattr(self.inner, "only", None)
         return method if isinstance(method, HasJoint) else None
 

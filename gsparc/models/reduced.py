@@ -26,17 +26,17 @@ Measured = dict[str, Tensor]
 
 
 def knobs(method: Method) -> tuple[str, ...]:
-    """Names of the settings that mean something to a method; none where it is not `Reducible`."""
+    """Return names of the settings that mean something to a method; none where it is not `Reducible`."""
     return method.knobs() if isinstance(method, Reducible) else ()
 
 
 def contributions(method: Method, data: Measurements, rows: np.ndarray) -> Measured:
-    """What must be known of training rows (n,) to reduce a method; stored with the model."""
+    """Return what must be known of training rows (n,) to reduce a method; stored with the model."""
     return method.contributions(data, rows) if isinstance(method, Reducible) else {}
 
 
 def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
-    """The method with `settings`; itself when there are none."""
+    """Return the method with `settings`; itself when there are none."""
     return method.reduced(settings, measured) if settings and isinstance(method, Reducible) else method
 
 
@@ -116,11 +116,11 @@ class View(Method):
         return "what answers faster does so in float32; load the whole model"
 
     def size(self) -> int:
-        """As the inner method's."""
+        """Return the inner method's."""
         return self.inner.size()
 
     def objects(self) -> SiteObjects:
-        """As the inner method's."""
+        """Return the inner method's."""
         return self.inner.objects()
 
     def fit(self, *unused: Any, **named: Any) -> NoReturn:
@@ -189,7 +189,7 @@ class Filled(View):
         return Prediction(self.fill(result.mean), result.variance, result.unknown)
 
     def fill(self, image: Tensor) -> Tensor:
-        """(B, h, w) -> (B, H, W)."""
+        """Fill images (B, h, w) up to (B, H, W)."""
         beside = image.index_select(2, self._next)
         # (B, h, w, stride): flattened, the pixels filled in stand between their two columns.
         wide = torch.lerp(image[..., None], beside[..., None], self._between).flatten(2)
@@ -228,7 +228,7 @@ def mean_alone(process: Method, settings: Settings | None = None) -> Method:
 
 
 def averaged(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
-    """A reduced field averaged with as many pixels of the process.
+    """Return a reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
 

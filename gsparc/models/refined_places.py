@@ -95,7 +95,7 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
 
 
 def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
-    """Rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
+    """Return rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
         field: conditioned on these rows at the places of `data`, channels or powers of one moving end.
@@ -153,7 +153,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
 
 
 def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
-    """The moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
+    """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
     name = "tx" if data.site.moving_end == "tx" else "rx_position"
     moved = getattr(data, name).copy()
     moved[rows] += by

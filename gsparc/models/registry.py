@@ -44,7 +44,7 @@ def method_class(name: str) -> type[MethodFactory]:
 
 
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
-    """The method that a config of the group `model` describes (unfitted), or what chooses it.
+    """Return the method that a config of the group `model` describes (unfitted), or what chooses it.
 
     Args:
         config: `_target_` and its arguments.

@@ -46,14 +46,14 @@ class RunFactors:
         return len(self.runs)
 
     def of(self, run: Tensor | None) -> Tensor:
-        """Factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
+        """Return factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
         if run is None or len(self) == 1:
             return torch.ones(1, dtype=torch.complex128)
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
     def restored(self, answer: Prediction, run: Tensor | None) -> Prediction:
-        """A prediction for the largest run in the phase and level of rows of runs (B,)."""
+        """Return a prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return answer
         of = self.of(run).to(answer.mean.device)
@@ -63,7 +63,7 @@ class RunFactors:
         return replace(answer, mean=answer.mean * factor, variance=variance, explained=explained)
 
     def aligned(self, data: Measurements) -> Measurements:
-        """The channels in the phase and level of the largest run, as of one run."""
+        """Return the channels in the phase and level of the largest run, as of one run."""
         if data.run is None or len(self) == 1:
             return data
         factor = self.of(torch.from_numpy(data.run)).numpy()
@@ -72,7 +72,7 @@ class RunFactors:
         return replace(data, target=target, noise_variance=noise, run=None)
 
     def state(self) -> dict[str, Tensor]:
-        """What `read` reads."""
+        """Return what `read` reads."""
         return {"runs": torch.from_numpy(self.runs), "factors": self.factors}
 
     @staticmethod
@@ -94,7 +94,7 @@ def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.
 
 
 def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
+    """Return M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member
 

@@ -34,7 +34,7 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
 
 
 def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
-    """Stored targets (n, ...) as float32 rows (n, D).
+    """Return stored targets (n, ...) as float32 rows (n, D).
 
     Spectra are rows of pixels in [0, 1], channels real and imaginary parts in linear units, powers decibels.
     """
@@ -48,7 +48,7 @@ def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
 
 
 def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
-    """Float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
+    """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
     if kind == "csi":
         return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
     rows = rows.reshape(len(rows), *shape)
@@ -80,6 +80,6 @@ def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
 
 
 def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
-    """Powers of rows (n,) in decibels, levels where they are censored."""
+    """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
     return Rows(data.moving[rows], decibels, data.side(rows))

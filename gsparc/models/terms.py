@@ -62,7 +62,7 @@ class Terms:
 def called_for(
     switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
 ) -> Terms:
-    """The terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
+    """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
 
     `distant`: whether emissions fall with the distance, which makes them no linear read-out of an array.
 

@@ -113,7 +113,7 @@ class FitContext:
             )
 
     def within(self, folder: str, **changes: Any) -> FitContext:
-        """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
         if self.loggers:
             from gsparc.training.tracking import Part  # imports Lightning
 
@@ -131,6 +131,6 @@ class FitContext:
         curve.log(self.loggers, row)
 
     def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
-        """What a fit counts, and the seconds that may end it, some spent before."""
+        """Return what a fit counts, and the seconds that may end it, some spent before."""
         seconds = math.inf if self.budget_s is None else self.budget_s
         return TimeBudget(seconds, self.budget_clock, before, Effort().times(self.effort))

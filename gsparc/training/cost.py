@@ -42,7 +42,7 @@ class Cost:
         return sum(self.unused.values())
 
     def described(self, limited_by: Clock | None) -> str:
-        """One line."""
+        """Return one line."""
         parts = []
         for name, spent in self.stages.items():
             unused = f" ({self.unused[name]:.1f} s unused)" if name in self.unused else ""

@@ -42,7 +42,7 @@ class Effort:
     steps_after_solving: int = 60
 
     def times(self, factor: float) -> Effort:
-        """All of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
+        """Return all of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
         counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
         rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
         return Effort(**{name: max(round(count), 1) for name, count in {**counts, **rows}.items()})
@@ -64,7 +64,7 @@ class Spent:
     processor: float = 0.0
 
     def by(self, clock: Clock) -> float:
-        """[s]"""
+        """Return seconds of the clock [s]."""
         return self.wall if clock == "wall" else self.processor
 
     def __add__(self, other: Spent) -> Spent:

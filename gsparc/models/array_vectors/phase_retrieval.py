@@ -58,7 +58,7 @@ class Recovered:
 def recover(
     site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
 ) -> Recovered:
-    """Array vectors of spectra.
+    """Return array vectors of spectra.
 
     Args:
         site: array, wavelength, grid and normalisation.

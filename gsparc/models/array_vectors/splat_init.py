@@ -64,7 +64,7 @@ class Learned:
 
 
 def through_array(task: InitTask) -> Start:
-    """Gaussians whose emissions through the array are the posterior of its vectors.
+    """Return Gaussians whose emissions through the array are the posterior of its vectors.
 
     Raises:
         ValueError: no array, no rows, or an emission that is not linear in its features.

@@ -43,7 +43,7 @@ def mirror_elements(array: np.ndarray) -> np.ndarray | None:
 
 
 def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
-    """Vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
+    """Return vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
 
     Walks a minimum spanning tree of the positions (n, 3) [m]; each sample is compared with its four nearest
     predecessors.
@@ -104,7 +104,7 @@ def matched(
 def refine_alignment(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
 ) -> np.ndarray:
-    """Phases and twins (n, M) of largest likelihood, one sample at a time given all others.
+    """Return phases and twins (n, M) of largest likelihood, one sample at a time given all others.
 
     The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
     eq. 5.12).
@@ -130,7 +130,7 @@ def refine_alignment(
 def aligned_by(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
 ) -> np.ndarray:
-    """Vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
+    """Return vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.

@@ -55,7 +55,7 @@ def law_variance(law: Law) -> float:
 
 
 def log_below(z: np.ndarray) -> np.ndarray:
-    """Logarithm of the probability that a residual lies below z (n,) scales."""
+    """Return the logarithm of the probability that a residual lies below z (n,) scales."""
     tail = np.minimum(z, -CORNER)  # exponential: its logarithm is a line, however far out
     far = CORNER**2 / 2 + CORNER * tail - math.log(CORNER)
     edge = math.exp(-(CORNER**2) / 2) / CORNER
@@ -110,7 +110,7 @@ def _start(decades: np.ndarray, rows: Rows) -> np.ndarray:
 
 
 def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
-    """The law of largest likelihood; the floor is chosen by it too.
+    """Return the law of largest likelihood; the floor is chosen by it too.
 
     Args:
         rows: at least one.
@@ -135,7 +135,7 @@ def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
 
 
 def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
-    """The place (3,) [m] of a still end that explains powers best, from several starts.
+    """Return the place (3,) [m] of a still end that explains powers best, from several starts.
 
     Heights above and below the places' own plane fit alike: one of the two is found.
     """

@@ -54,7 +54,7 @@ class Components:
 
 
 def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int = 2048) -> Components:
-    """All components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
+    """Return all components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
 
     Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
     """
@@ -84,7 +84,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
 
 
 def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
-    """Length and noise of largest leave-one-out likelihood, from three starting lengths.
+    """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
         positions: (n, 3) [m].
@@ -206,7 +206,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
-        """The mean (B, ...) of `predict` alone: the variance is most of a prediction."""
+        """Return the mean (B, ...) of `predict` alone: the variance is most of a prediction."""
         assert self.site is not None
         places, dtype = query.places(self.site), query.tx.dtype
         if self.powers is not None:
@@ -345,5 +345,5 @@ class ReducedMean(View):
         return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
 
     def size(self) -> int:
-        """Components kept."""
+        """Return the number of components kept."""
         return len(self._axes)

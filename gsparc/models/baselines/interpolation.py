@@ -74,7 +74,7 @@ class Interpolator(Method):
         return self._look_up(queries.detach().numpy())
 
     def state(self) -> dict[str, Any]:
-        """Target shape, number of rows, and what the subclass learned."""
+        """Return the target shape, the number of rows, and what the subclass learned."""
         return {"shape": list(self.shape), "seen": self.seen, **self._learned()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -83,7 +83,7 @@ class Interpolator(Method):
         self._relearn(state)
 
     def size(self) -> int:
-        """Number of stored training samples."""
+        """Return the number of stored training samples."""
         return self.seen
 
     @property

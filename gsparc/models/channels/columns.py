@@ -104,11 +104,11 @@ class Group(At):
         return len(self.places)
 
     def take(self, index: Tensor) -> Group:
-        """The rows (m,) of these numbers."""
+        """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
     def drawn(self, rows: float) -> Group:
-        """At most so many rows, drawn evenly."""
+        """Return at most so many rows, drawn evenly."""
         if len(self) <= rows:
             return self
         # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
@@ -119,7 +119,7 @@ class Group(At):
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
 
     def state(self, factors: Tensor) -> dict[str, Any]:
-        """What `read` reads; targets as measured, of runs of these factors."""
+        """Return what `read` reads; targets as measured, of runs of these factors."""
         # Groups hold aligned targets, and `aligned` divides by the factors again when they are read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
@@ -142,7 +142,7 @@ def refuse(site: Site) -> None:
 
 
 def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
-    """Groups of the given rows (n,).
+    """Return groups of the given rows (n,).
 
     Args:
         data: kind csi; one end is static, or there are several static stations, or both ends move.
@@ -208,7 +208,7 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
 
 
 def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
-    """Tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
     # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
@@ -216,7 +216,7 @@ def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
 
 
 def static_place(site: Site, station: int) -> Tensor:
-    """(3,) float64 [m], local; NaN where unknown."""
+    """Return the place (3,) float64 [m] of a static end, local; NaN where unknown."""
     if site.stations is not None:
         return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
     if site.static_position is None:
@@ -225,7 +225,7 @@ def static_place(site: Site, station: int) -> Tensor:
 
 
 def carrier_of(site: Site, station: int) -> float:
-    """Carrier [Hz] of a station."""
+    """Return the carrier [Hz] of a station."""
     if site.stations is not None and site.stations.carrier_hz is not None:
         return float(site.stations.carrier_hz[station])
     assert site.carrier_hz is not None
@@ -257,7 +257,7 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
 
 
 def ends_of(groups: tuple[Group, ...]) -> int:
-    """How many static ends there are."""
+    """Return how many static ends there are."""
     return len({group.slot.station for group in groups})
 
 
@@ -286,7 +286,7 @@ def aligned(
 
 
 def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Negative log likelihood [nats] of what `aligned` says, scales profiled out."""
+    """Return the negative log likelihood [nats] of what `aligned` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
@@ -312,7 +312,7 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
 
 
 def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
-    """At most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
+    """Return at most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.
     """

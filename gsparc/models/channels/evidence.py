@@ -94,7 +94,7 @@ def parameters(prior: ChannelPrior) -> Tensor:
 
 
 def normalised(group: Group) -> Group:
-    """The same with targets of unit mean square."""
+    """Return the same with targets of unit mean square."""
     # A silent group stays 0 instead of 0 / 0.
     level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
     return replace(group, target=group.target / level)
@@ -121,7 +121,7 @@ def compressed(
 
 
 def without(part: Compressed, left: Tensor) -> Compressed:
-    """The rows but those of `left` (n,) bool, from the same matrices."""
+    """Return the rows but those of `left` (n,) bool, from the same matrices."""
     rest = torch.nonzero(~left).flatten()
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
@@ -147,7 +147,7 @@ def solved(part: Compressed, power: Tensor) -> Solved:
 
 
 def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
-    """Gradient (P,) of the negative log likelihood by logarithms of own powers."""
+    """Return the gradient (P,) of the negative log likelihood by logarithms of own powers."""
     count, outputs = part.group.target.shape
     weights = at.given.weights
     weight = at.given.factor.inverse.addmm(weights, weights.mH, beta=outputs, alpha=-1 / at.scale)
@@ -158,7 +158,7 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
 
 
 def evidence(parts: tuple[Compressed, ...], prior: ChannelPrior) -> float:
-    """Negative log marginal likelihood of all groups [nats]."""
+    """Return the negative log marginal likelihood of all groups [nats]."""
     return sum(solved(part, part.own(prior)).nll for part in parts)
 
 
@@ -208,7 +208,7 @@ def minimised(
     steps: int,
     settled: float = 1e7 * torch.finfo(torch.float64).eps,  # SciPy's own default of `ftol`
 ) -> tuple[Tensor, float]:
-    """Where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
+    """Return where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
 
     def told(at: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = objective(torch.from_numpy(at))

@@ -68,7 +68,7 @@ class Weights:
         return short if float(error) <= ROUNDED * self.noise else root
 
     def learned(self, cross: Tensor) -> Tensor:
-        """Variance (m,) that the rows take away from places of covariances (m, n) with them."""
+        """Return the variance (m,) that the rows take away from places of covariances (m, n) with them."""
         cross = (cross.real if self.is_real else cross).to(self.root.dtype)
         return (cross.conj() @ self.root.T).abs().square().sum(1)
 
@@ -111,7 +111,7 @@ class ChannelField(ClosedForm):
         return self.prior.get(Direct) is not None or self.size() > 0
 
     def size(self) -> int:
-        """Images."""
+        """Return the number of images."""
         images = self.prior.get(Images)
         return 0 if images is None else len(images.planes)
 
@@ -121,7 +121,7 @@ class ChannelField(ClosedForm):
         return tuple(term.name for term in self.prior.terms if term.name)
 
     def objects(self) -> SiteObjects:
-        """The mirror planes that static ends share."""
+        """Return the mirror planes that static ends share."""
         images = self.prior.get(Images)
         return SiteObjects.of(planes=None if images is None else images.planes.numpy())
 

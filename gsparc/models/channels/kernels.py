@@ -22,17 +22,17 @@ FLAT_RAD = 0.5  # phase over the height of places, below which waves from above 
 
 
 def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Matern-3/2 of distances [m]."""
+    """Return Matern-3/2 of distances [m]."""
     return matern32_of_squares((distance / length).square())
 
 
 def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Squared exponential of distances [m]."""
+    """Return the squared exponential of distances [m]."""
     return torch.exp(-0.5 * (distance / length).square())
 
 
 def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
-    """Correlation (...) complex128 of waves that come from about one direction.
+    """Return the correlation (...) complex128 of waves that come from about one direction.
 
     Args:
         squared: (...) float64, (k d)^2 of displacements d.
@@ -76,7 +76,7 @@ def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tenso
 
 
 def sphere(count: int) -> Tensor:
-    """Unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
+    """Return unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
     height, turn = 1 - 2 * number / count, math.pi * (1 + 5**0.5) * number
     radius = (1 - height.square()).sqrt()

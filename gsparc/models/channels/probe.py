@@ -53,7 +53,7 @@ class Probe:
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
     def known(self, waves: Tensor) -> Tensor:
-        """f^H C^-1 f (m,) float64 of waves (m, n)."""
+        """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
         inside, basis, downdate = (
             (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
         )

@@ -185,5 +185,5 @@ class DirectionalGP(SourcesInFrame):
         return ("phase", "visibility")
 
     def size(self) -> int:
-        """Sources."""
+        """Return the number of sources."""
         return len(self.posterior.power) if self.site is not None else 0

@@ -49,7 +49,7 @@ class GainKernel:
     noise: float
 
     def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(n, m) of places (n, 3) and (m, 3) float64 [m]."""
+        """Return the correlation (n, m) of places (n, 3) and (m, 3) float64 [m]."""
         squared = (apart(first, second) / self.length).square()
         return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
 
@@ -142,7 +142,7 @@ class SightedSources:
         return self
 
     def learned(self) -> SightedSources:
-        """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
@@ -174,11 +174,11 @@ class SightedSources:
         return Arrival(ranges(places, self.positions.points), probability.to(dtype), correlation, retained)
 
     def at_rows(self, probability: Tensor) -> Arrival:
-        """The rows' own geometry, with the probability (receivers, K) that each sees each source."""
+        """Return the rows' own geometry, with the probability (receivers, K) that each sees each source."""
         return self.at(self.rows.position, self.rows.frequency, probability[self.observer])
 
     def gains(self, at: Arrival) -> Tensor:
-        """Posterior mean gains (m, K, R) where they are seen."""
+        """Return the posterior mean gains (m, K, R) where they are seen."""
         weights = self.dual_weights
         gain = (at.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
         if len(self.uncertain):
@@ -187,7 +187,7 @@ class SightedSources:
         return torch.view_as_complex(gain)
 
     def variance(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
-        """Expected squared error and expected power (m,); of gains, noise and visibility."""
+        """Return the expected squared error and expected power (m,); of gains, noise and visibility."""
         probability, noise = at.probability, self.kernel.noise
         arriving = wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
@@ -198,7 +198,7 @@ class SightedSources:
         return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise
 
     def left_out(self) -> Tensor:
-        """The rows (n, R), each receiver and its own visibility left out."""
+        """Return the rows (n, R), each receiver and its own visibility left out."""
         at = self.at_rows(self.visibility.left_out)
         cross = self._cross(self.unobstructed * at.probability, at.retained, self.power) * at.correlation
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse

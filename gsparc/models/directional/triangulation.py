@@ -61,7 +61,7 @@ class Rays:
         return len(self.owner)
 
     def take(self, mask: np.ndarray) -> Rays:
-        """A subset, of the same receivers."""
+        """Return a subset, of the same receivers."""
         return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ class RayClusters:
     error: float
 
     def seen(self, rays: Rays) -> np.ndarray:
-        """(n, K), 1 where a receiver has a ray from a point, else 0."""
+        """Return (n, K), 1 where a receiver has a ray from a point, else 0."""
         table = np.zeros((len(rays.places), len(self.points)))
         k, ray = np.nonzero(self.responsibility > 0.5)
         table[rays.owner[ray], k] = 1.0
@@ -96,7 +96,7 @@ class RayClusters:
 
 
 def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
-    """All points where rays intersect, by falling evidence."""
+    """Return all points where rays intersect, by falling evidence."""
     rng = np.random.default_rng(seed)
     empty = RayClusters(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, len(rays))), MAX_ERROR)
     error = _initial_error(rays, rng)

@@ -70,7 +70,7 @@ class VisibilityGP:
         return VisibilityGP(places, seen, length, weights, left_out)
 
     def probability(self, places: Tensor) -> Tensor:
-        """Probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
+        """Return the probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
         lengths, weights = self._by_length
         correlation = matern32_of_squares((apart(places, self.places)[:, None] / lengths).square()).flatten(1)
         return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
@@ -100,7 +100,7 @@ class RayErrorRates:
 
     @staticmethod
     def first(rays: Tensor) -> RayErrorRates:
-        """Initial rates from rays (n, K), as if all receivers saw the source with most rays."""
+        """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
     @staticmethod
@@ -119,7 +119,7 @@ class RayErrorRates:
 
 
 def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
-    """(n, K) bool, at most one visibility entry to change per receiver.
+    """Return (n, K) bool, at most one visibility entry to change per receiver.
 
     Args:
         seen: (n, K) of zeros and ones.

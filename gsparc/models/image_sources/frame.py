@@ -54,12 +54,12 @@ class Frame:
         return Frame(site, antennas, rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
     def inside(self, rows: Rows) -> Rows:
-        """Rows in local metres and stored units, normalised."""
+        """Return rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
 
     def places(self, query: Query) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the frame, and B.
+        """Return antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
@@ -78,7 +78,7 @@ class Frame:
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
     def state(self) -> dict[str, Any]:
-        """What makes it again, of the same site."""
+        """Return what makes it again, of the same site."""
         return {name: value for name, value in vars(self).items() if name != "site"}
 
 

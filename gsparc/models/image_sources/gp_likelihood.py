@@ -29,7 +29,7 @@ from gsparc.processes.conditioned import Conditioned
 
 
 def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
-    """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    """Return targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
     # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
     covariance.diagonal().add_(noise + JITTER * level)
@@ -57,7 +57,7 @@ class CircularGains:
         self._imag.addcmul_(correlation, turned @ pair.T)
 
     def given(self, noise: Tensor | float) -> Conditioned:
-        """The rows' targets given the covariance with noise of this variance."""
+        """Return the rows' targets given the covariance with noise of this variance."""
         # In place and for good: `Posterior.conditioned` calls it once.
         self._real.diagonal().add_(noise)
         return Conditioned.of(self.matrix, self.target)
@@ -73,21 +73,21 @@ class CircularGains:
         return 2 * slopes
 
     def by_noise(self, slope: Tensor) -> Tensor:
-        """The derivative () by the variance of the noise."""
+        """Return the derivative () by the variance of the noise."""
         return slope.diagonal().real.sum()
 
     def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
-        """Derivatives (n, n) by the correlation of one source."""
+        """Return derivatives (n, n) by the correlation of one source."""
         return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
 
 def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
-    """p and q, each (2 n, ...) float32, of complex (n, ...)."""
+    """Return p and q, each (2 n, ...) float32, of complex (n, ...)."""
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
 def shares(quadrature: Tensor | float) -> Tensor:
-    """Variance along and across a gain's phase, (2,)."""
+    """Return the variance along and across a gain's phase, (2,)."""
     return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
 
@@ -110,7 +110,7 @@ class PhasedGains(CircularGains):
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
     def given(self, noise: Tensor | float) -> Conditioned:
-        """The rows' targets, half of the noise in either part."""
+        """Return the rows' targets, half of the noise in either part."""
         self.matrix.diagonal().add_(noise / 2)
         return Conditioned.of(self.matrix, stacked(self.target)[0])
 
@@ -181,7 +181,7 @@ class Posterior:
         return self.conditioned.nll
 
     def without(self, k: int) -> float:
-        """`nll` of the scene without source k, of circular gains."""
+        """Return `nll` of the scene without source k, of circular gains."""
         one, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
         one.add(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
@@ -204,7 +204,7 @@ class Posterior:
         return constant * self.dual_weights.sum(1) * self.scene.turns[:, None]
 
     def left_out(self) -> Tensor:
-        """Leave-one-receiver-out predictions (n, R) complex64.
+        """Return leave-one-receiver-out predictions (n, R) complex64.
 
         Rasmussen and Williams (2006), eq. 5.12, in blocks.
         """

@@ -288,7 +288,7 @@ class ImageSourceGP(SourcesInFrame):
         return gain.movedim(0, -1), away, self.query.sources
 
     def left_out(self) -> LeftOutRows:
-        """Receivers, each predicted from all others."""
+        """Return receivers, each predicted from all others."""
         frame = self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
@@ -345,7 +345,7 @@ class ImageSourceGP(SourcesInFrame):
         return ("phase", "visibility") if any(len(one.scene.clutter) for one in self.members) else ("phase",)
 
     def objects(self) -> SiteObjects:
-        """Planes and boxes of the heaviest search."""
+        """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
         planes = scene.planes.double()
         normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
@@ -361,7 +361,7 @@ class ImageSourceGP(SourcesInFrame):
             self._conditioned(self._rows(data, rows), [member.scene for member in self.members])
 
     def size(self) -> int:
-        """Sources of the largest scene."""
+        """Return the number of sources of the largest scene."""
         return max((len(member.scene.sequences) for member in self.members), default=0)
 
 

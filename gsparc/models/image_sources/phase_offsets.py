@@ -24,7 +24,7 @@ class OffsetEstimate:
     delay: np.ndarray
 
     def removed(self, target: np.ndarray, frequency_hz: np.ndarray, carrier_hz: float) -> np.ndarray:
-        """Targets (S, A, K) without their offsets."""
+        """Return targets (S, A, K) without their offsets."""
         phasor = 2 * np.pi * (frequency_hz - carrier_hz) * self.delay[:, None] - self.phase[:, None]
         return (target * np.exp(1j * phasor)[:, None]).astype(target.dtype)
 
@@ -37,7 +37,7 @@ def estimate(
     timing: bool,
     mask: np.ndarray | None = None,
 ) -> OffsetEstimate:
-    """The offsets that maximise the correlation of snapshots with their predictions.
+    """Return the offsets that maximise the correlation of snapshots with their predictions.
 
     Args:
         target, predicted: (S, A, K) complex.

@@ -121,7 +121,7 @@ class Means:
         return means, *self.variance(arriving, varying[:first])
 
     def gains(self, queries: Tensor) -> Tensor:
-        """Complex gains (K, m, R) of the sources of all processes at queries."""
+        """Return complex gains (K, m, R) of the sources of all processes at queries."""
         return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -40,7 +40,7 @@ class Rows:
         return len(self.position)
 
     def take(self, index: Tensor) -> Rows:
-        """The rows with these numbers."""
+        """Return the rows with these numbers."""
         element = None if self.element is None else self.element[index]
         measured = (self.target[index], self.receiver[index])
         return Rows(self.position[index], self.frequency[index], *measured, self.array, element)
@@ -53,12 +53,12 @@ class Rows:
         return torch.cat([self.position, self.array[self.element]], 1)
 
     def static_ends(self, static: Tensor) -> Tensor:
-        """The static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
+        """Return the static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
         return static if self.array is None else static + self.array
 
 
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
-    """Antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
+    """Return antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
 
     By reciprocity the moving transmitter receives from each of them; those of unknown places are outputs.
     """
@@ -96,7 +96,7 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
 
 
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
-    """At most `limit` rows from the given measurements.
+    """Return at most `limit` rows from the given measurements.
 
     Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
     of these the same number of tones, a comb over the band with a random start, so that together they cover
@@ -140,13 +140,13 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
 
 
 def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
-    """`channel_places` of measurements (S,)."""
+    """Return `channel_places` of measurements (S,)."""
     position, rotation = (torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation))
     return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
 def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
-    """Ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
+    """Return ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
 
     Args:
         places: see `Rows.places`.
@@ -160,6 +160,6 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
 
 
 def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
+    """Return the lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
     places = torch.cat([rows.position, transmitter[None]])
     return torch.stack([places.amin(0), places.amax(0)])

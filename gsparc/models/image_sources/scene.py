@@ -40,7 +40,7 @@ class KernelVisibility:
     length: float | Tensor = 2.0
 
     def correlation(self, places: Tensor, source: Tensor) -> Tensor:
-        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
+        """Return (n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
@@ -99,7 +99,7 @@ class Scene:
 
     @staticmethod
     def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
-        """The static end (3,) [m] alone, of log amplitude (1,)."""
+        """Return the static end (3,) [m] alone, of log amplitude (1,)."""
         return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
 
     @cached_property
@@ -130,7 +130,7 @@ class Scene:
         return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
 
     def scatterers(self, rows: Rows) -> Tensor:
-        """Which sources (K,) bool are scatterers; others are images.
+        """Return which sources (K,) bool are scatterers; others are images.
 
         A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands
         inside the box of receivers and transmitter, the transmitter itself apart, is a scatterer.
@@ -141,7 +141,7 @@ class Scene:
         return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
     def images(self, rows: Rows) -> Tensor:
-        """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
+        """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
     def unobstructed(self, rows: Rows) -> Tensor:
@@ -150,7 +150,7 @@ class Scene:
         return waves if self.phase is None else waves * self.turns
 
     def waves(self, rows: Rows) -> Tensor:
-        """The same, attenuated by clutter."""
+        """Return the same, attenuated by clutter."""
         waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
         return waves if self.phase is None else waves * self.turns
 
@@ -162,13 +162,13 @@ class Scene:
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
     def over(self, sequences: Iterable[Reflections]) -> Scene:
-        """Other sequences over the same planes, of gains that are not known."""
+        """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
     def with_sequences(
         self, sequences: list[Reflections], amplitude: Tensor, phase: Tensor | None = None
     ) -> Scene:
-        """More sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
+        """Return more sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
         if phase is not None and self.phase is not None:
             phase = torch.cat([self.phase, phase])
@@ -177,7 +177,7 @@ class Scene:
         )
 
     def only(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
-        """The sources of these indices, and the planes that they use, or that are named."""
+        """Return the sources of these indices, and the planes that they use, or that are named."""
         sequences = [self.sequences[i] for i in indices]
         used = sorted({index for sequence in sequences for index in sequence}.union(planes))
         new = {old: i for i, old in enumerate(used)}
@@ -192,7 +192,7 @@ class Scene:
 
 
 def steering(rows: Rows, sources: Tensor) -> Tensor:
-    """Spherical waves (n, K) complex64 of sources at every row.
+    """Return the spherical waves (n, K) complex64 of sources at every row.
 
     Args:
         rows: n of them.
@@ -209,18 +209,18 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
 
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
+    """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
     waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
 
 
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
-    """Visibility correlations (K, n, n) float32."""
+    """Return visibility correlations (K, n, n) float32."""
     return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
 def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
+    """Return unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
     offset = places - sources[..., None, :]
     return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
 

@@ -87,7 +87,7 @@ class SearchCache:
         log.info("reusing %d cached searches (%.0f s of training time)", len(searches), wall)
 
     def find(self, number: int) -> Member | None:
-        """The finished search of this number, or None."""
+        """Return the finished search of this number, or None."""
         with self._lock:
             search = self._searches.get(f"search {number}")
         return None if search is None else made(Member, search)

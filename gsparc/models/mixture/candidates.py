@@ -27,13 +27,13 @@ Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
 
 
 def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Image sources of several searches, and a process on what they leave."""
+    """Return image sources of several searches, and a process on what they leave."""
     method = ImageSourceGP(**_searched(init, clutter, context))
     return Residual(method) if residual else method
 
 
 def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Images of the static end in the walls of `init.file`.
+    """Return images of the static end in the walls of `init.file`.
 
     Raises:
         DataError: no such file, or walls that cannot be.
@@ -53,12 +53,12 @@ def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContex
 
 
 def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Powers of several stations in one process; without `clutter` they share their law alone."""
+    """Return powers of several stations in one process; without `clutter` they share their law alone."""
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
 def bearings(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Sources where bearings cross, of at most `init.searches` searches."""
+    """Return sources where bearings cross, of at most `init.searches` searches."""
     search = replace(SearchSettings(), sources=init.max_sources)
     searches = max(round(init.searches * context.effort), 1)
     return MovingArrayField(search=search, seed=context.seed, searches=searches)

@@ -139,7 +139,7 @@ def _reached(race: Race | None) -> str | None:
 def weigh_candidates(
     solutions: dict[str, ClosedForm], data: Measurements, fold: Fold, cut: InnerFolds | None
 ) -> dict[str, tuple[ClosedForm, float]]:
-    """Solutions with their weights where positive, by rows which they were not conditioned on.
+    """Return solutions with their weights where positive, by rows which they were not conditioned on.
 
     Those are validation rows, and training rows as `cut`; one solution needs neither.
     """

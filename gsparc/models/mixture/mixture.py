@@ -74,11 +74,11 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
 
     @abstractmethod
     def tries(self, data: Measurements) -> Mapping[str, Candidate]:
-        """Candidates by name, weighed where they are several."""
+        """Return candidates by name, weighed where they are several."""
 
     @abstractmethod
     def obstacle(self, data: Measurements) -> str | None:
-        """Why this cannot be solved for such measurements; None where it can."""
+        """Return why this cannot be solved for such measurements; None where it can."""
 
     @property
     def plain(self) -> bool:
@@ -246,7 +246,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
     def left_out(self) -> LeftOutRows:
-        """The mean of all."""
+        """Return the mean of all."""
         result = [member.left_out() for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
@@ -311,11 +311,11 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
 
     def size(self) -> int:
-        """Gaussians of all members."""
+        """Return the number of Gaussians of all members."""
         return sum(member.count for member in self.members)
 
     def objects(self) -> SiteObjects:
-        """Those of the heaviest member that found any."""
+        """Return those of the heaviest member that found any."""
         result = [self.members[i].objects() for i in np.argsort(self.weights)[::-1]]
         return next((one for one in result if len(one)), result[0])
 

@@ -103,11 +103,11 @@ class Residual(ReducedByPart, ClosedForm):
         return self.method.terms if self.rest is None else (*self.method.terms, "residual")
 
     def size(self) -> int:
-        """The method's."""
+        """Return the method's."""
         return self.method.size()
 
     def objects(self) -> SiteObjects:
-        """The method's."""
+        """Return the method's."""
         return self.method.objects()
 
     @property

@@ -79,7 +79,7 @@ def share_of_second(parts: Sequence[Rows]) -> float:
 
 
 def error(predicted: Tensor, target: Tensor) -> float:
-    """Share of the target's energy that is missed."""
+    """Return the share of the target's energy that is missed."""
     missed = (predicted - target).abs().square().sum()
     return float(missed / target.abs().square().sum().clamp_min(1e-30))
 
@@ -92,7 +92,7 @@ def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
 
 
 def comparable(values: Tensor, site: Site) -> Tensor:
-    """Values in the unit that errors are counted in: powers in decibels."""
+    """Return values in the unit that errors are counted in: powers in decibels."""
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
@@ -104,13 +104,13 @@ def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
 
 
 def real(values: Tensor) -> Tensor:
-    """Entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
+    """Return entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
     return values.double().flatten(1)
 
 
 def best_weights(gram: np.ndarray) -> np.ndarray:
-    """Weights (K,), none negative, summing to one, of the smallest w^T `gram` w; gram is (K, K).
+    """Return weights (K,), none negative, summing to one, of the smallest w^T `gram` w; gram is (K, K).
 
     Scaled to any sum s, the smallest s^2 w^T G w + (s - 1)^2 belongs to the same w: plain non-negative least
     squares.
@@ -160,7 +160,7 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
 
 
 def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """Squared errors (n,) of a mixture (K,) from products (n, K, K)."""
+    """Return the squared errors (n,) of a mixture (K,) from products (n, K, K)."""
     return np.einsum("k,nkl,l->n", weights, gram, weights)
 
 

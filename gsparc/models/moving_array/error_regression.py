@@ -73,7 +73,7 @@ class ErrorRegression(WithKernel):
     prior: float
 
     def expected(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-        """What is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
+        """Return what is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
 
         An image is known to its relative error with weight c and not at all with weight 1 - c, the
         correlation c of a source's power over what the nearest row is farther than the largest gap of rows.

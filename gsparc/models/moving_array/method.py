@@ -66,7 +66,7 @@ class Spectra:
         return torch.from_numpy(self.places).float()
 
     def at(self, rows: np.ndarray) -> Spectra:
-        """Some of them."""
+        """Return some of them."""
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
@@ -300,27 +300,27 @@ class MovingArrayField(Differentiable, ClosedForm):
         return Prediction(mean, variance, unknown, answer.explained.clamp(0, 1))
 
     def query(self) -> Images:
-        """Answers with all that was found, made once."""
+        """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
             self._query = Images(self.array(), self.basis, self.trends, self.residual, places)
         return self._query
 
     def size(self) -> int:
-        """Number of sources of all searches."""
+        """Return the number of sources of all searches."""
         return sum(len(trend.sources) for trend in self.trends)
 
     def array(self, stride: int = 1) -> Array:
-        """That looks, at every `stride`-th pixel."""
+        """Return the array, which looks at every `stride`-th pixel."""
         return Array(self.lags(), self.rotation(), self.exponent, stride)
 
     def rotation(self) -> Tensor:
-        """(3, 3) of the array, receiver to world."""
+        """Return the rotation (3, 3) of the array, receiver to world."""
         assert self.site is not None and self.site.rx_rotation is not None
         return torch.from_numpy(np.asarray(self.site.rx_rotation)).float()
 
     def lags(self) -> Lags:
-        """The array's, computed once."""
+        """Return the array's lags, computed once."""
         assert self.site is not None
         if self._lags is None:
             self._lags = Lags(*self.site.array_geometry())

@@ -38,7 +38,7 @@ class WithKernel:
     kernel: Kernel
 
     def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers."""
+        """Return plain tensors and numbers."""
         return {**vars(self), "kernel": self.kernel.state()}
 
     @classmethod
@@ -77,7 +77,7 @@ def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, 
 def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
 ) -> tuple[Trend, np.ndarray]:
-    """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
+    """Return the trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
     weights, residual = solved(kernel, places, torch.from_numpy(power - level))
     # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more

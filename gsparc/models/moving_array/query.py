@@ -46,11 +46,11 @@ class Array:
         self._pixels = space.pixels if stride == 1 else space.pixels.thinned(stride)
 
     def atoms(self, sources: Tensor, receivers: Tensor) -> Tensor:
-        """Lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
+        """Return lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
         return self.space.atoms(bearings(sources, receivers, self.rotation))
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
-        """Images (n, H, W) of sources of powers (n, K)."""
+        """Return images (n, H, W) of sources of powers (n, K)."""
         images = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
         if self.exponent == 1 or not followed(images):
             return images if self.exponent == 1 else images.sqrt()
@@ -154,5 +154,5 @@ class ReducedMean(View):
         return Prediction(self._query(query.places(self.inner.site)).image.clamp_(0, 1))
 
     def size(self) -> int:
-        """Components kept."""
+        """Return the number of components kept."""
         return self._count

@@ -47,7 +47,7 @@ class Residual(WithKernel):
 
 
 def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int) -> tuple[Residual, Tensor]:
-    """The process on coefficients (n, R) at places (n, 3) [m], and its left-out predictions (n, R).
+    """Return the process on coefficients (n, R) at places (n, 3) [m], and its left-out predictions (n, R).
 
     Axes are those of the left-out predictions, fewer than those of the rows: a row's own details are on the
     latter, but in no prediction. What a prediction lacks of its axes adds about its energy to the error.

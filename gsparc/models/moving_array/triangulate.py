@@ -49,14 +49,14 @@ class SearchSettings:
 
 
 def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:
-    """Unit vectors (n, K, 3) from receivers (n, 3) to sources (K, 3) [m], receiver frame."""
+    """Return unit vectors (n, K, 3) from receivers (n, 3) to sources (K, 3) [m], receiver frame."""
     way = sources[None] - receivers[:, None]
     return (way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)) @ rotation
 
 
 @torch.no_grad()
 def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
-    """Power (n, K), none negative, of each source at each receiver.
+    """Return the power (n, K), none negative, of each source at each receiver.
 
     Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate descent from
     the clipped free solution (Franc, Hlavac and Navara 2005).
@@ -77,7 +77,7 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
 
 
 def mixture(power: Tensor, atoms: Tensor) -> Tensor:
-    """Lags (n, Q) of sources of the given power (n, K)."""
+    """Return lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
 
@@ -85,7 +85,7 @@ def find_sources(
     lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
     settings: SearchSettings, seed: int, over: Callable[[], bool],
 ) -> Tensor:  # fmt: skip
-    """Positions (K, 3) float32 [m] of sources.
+    """Return positions (K, 3) float32 [m] of sources.
 
     Args:
         lags: (n, Q) of the spectra.
@@ -194,7 +194,7 @@ def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
 
 
 def site_problem(data: Measurements) -> str | None:
-    """Why sources cannot be triangulated from these measurements; None when they can."""
+    """Return why sources cannot be triangulated from these measurements; None when they can."""
     otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
     problem = no_array(data.site, "tx", otherwise)
     if problem is not None:

@@ -73,7 +73,7 @@ class CalibratedRayTracer(Method):
         self._traced_effects()
 
     def problem(self, data: Measurements) -> str | None:
-        """Why it cannot serve these measurements; None where it may."""
+        """Return why it cannot serve these measurements; None where it may."""
         site = data.site
         if site.kind not in self.kinds:
             return f"{self.name}: needs received powers or channels, not {site.kind}"
@@ -188,7 +188,7 @@ class CalibratedRayTracer(Method):
         return self._tracer
 
     def state(self) -> dict[str, Any]:
-        """The scene's settings, the materials, the gain."""
+        """Return the scene's settings, the materials, the gain."""
         assert self.learned is not None
         return {
             "scene": self._scene_json, "learned": asdict(self.learned), "silent_db": self._silent_db,

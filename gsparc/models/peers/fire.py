@@ -33,7 +33,7 @@ class Network(nn.Module):
         self.decoder = perceptron(code, 2 * outputs, hidden, 2, nn.GELU)
 
     def forward(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Downlink (B, K) and the code's divergence from a standard normal (B,)."""
+        """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
         # KL divergence of N(m, s^2) from N(0, 1) (Kingma and Welling 2014, appendix B).

@@ -59,11 +59,11 @@ class GaussianNetwork(Network):
     field: GaussianField
 
     def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
-        """What each Gaussian emits (N,) for one position (1, 3)."""
+        """Return what each Gaussian emits (N,) for one position (1, 3)."""
         raise NotImplementedError
 
     def cloud(self, strengths: Tensor) -> GaussianCloud:
-        """The Gaussians, with what each emits (N,)."""
+        """Return the Gaussians, with what each emits (N,)."""
         return self.field.cloud(strengths, "emission of a Gaussian")
 
 
@@ -89,7 +89,7 @@ def render_each(
     grid: SphereGrid,
     **options: Any,
 ) -> Tensor:
-    """Images of samples with different Gaussians each, one plan per sample.
+    """Return images of samples with different Gaussians each, one plan per sample.
 
     Args:
         geometry: means (B, N, 3), quaternions (B, N, 4), scales (B, N, 3), opacities (B, N).

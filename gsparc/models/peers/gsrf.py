@@ -60,7 +60,7 @@ class ComplexGaussians(GaussianNetwork):
         self._frozen: FrozenPlan | None = None
 
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Radiance (B, N, 2) of each Gaussian towards the moving end."""
+        """Return radiance (B, N, 2) of each Gaussian towards the moving end."""
         towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
         # [m]: 1 / distance grows without end at the moving end itself.
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
@@ -74,7 +74,7 @@ class ComplexGaussians(GaussianNetwork):
         return torch.view_as_real(torch.view_as_complex(sent.contiguous()) * turns.squeeze(-1))
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W) or channels (B, A, K)."""
+        """Return spectra (B, H, W) or channels (B, A, K)."""
         sent, geometry = self.radiance(tx, rx), self.field.geometry()
         if self.response is not None:
             seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
@@ -88,7 +88,7 @@ class ComplexGaussians(GaussianNetwork):
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
+        """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
         plain = task_loss(seen, batch, self).mean()
         # A transform mixes all pixels, those that were not measured among them.
@@ -144,12 +144,12 @@ def _magnitude(image: Tensor) -> Tensor:
 
 
 def terms(degree: int, order: int) -> int:
-    """Number of terms of `fourier_legendre`."""
+    """Return the number of terms of `fourier_legendre`."""
     return (degree + 1) * (2 * order + 1)
 
 
 def fourier_legendre(directions: Tensor, degree: int, order: int) -> Tensor:
-    """P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
+    """Return P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
 
     With complex coefficients these span the same functions as P_l(cos theta) exp(j m phi), |m| <= `order`,
     l <= `degree`; theta is measured from z.

@@ -85,7 +85,7 @@ class MarchedField(Network):
         return error.mean()
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W), every ray of them."""
+        """Return spectra (B, H, W), every ray of them."""
         moving, pixels = self.scene.site.moving(tx, rx), torch.arange(len(self.directions))
         parts = []
         for sample, some in product(range(len(tx)), pixels.split(max(POINTS // self.samples, 1))):

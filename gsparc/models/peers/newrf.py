@@ -59,7 +59,7 @@ class NeWRF(TrainedPeer):
     neighbours: int = 6
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Virtual transmitters, and which of them every training receiver sees.
+        """Return virtual transmitters, and which of them every training receiver sees.
 
         Raises:
             ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
@@ -137,7 +137,7 @@ class DirectedRays(Network):
         return ((gain * wave).sum(-1) * likely).sum(-1)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Channels (B, 1, 1) at searched directions."""
+        """Return channels (B, 1, 1) at searched directions."""
         places = rx.position.reshape(-1, 3)
         return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
 
@@ -149,7 +149,7 @@ class DirectedRays(Network):
 
 
 def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Points where rays of several receivers meet, and which of them every receiver sees.
+    """Return points where rays of several receivers meet, and which of them every receiver sees.
 
     Args:
         places: (n, 3) [m].
@@ -202,6 +202,6 @@ def _merged(points: np.ndarray) -> np.ndarray:
 
 
 def votes(seen: list[np.ndarray], count: int) -> Tensor:
-    """How many rays of each receiver point at each virtual transmitter: (n, V) float32."""
+    """Return how many rays of each receiver point at each virtual transmitter: (n, V) float32."""
     table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
     return torch.from_numpy(table.astype(np.float32))

@@ -58,7 +58,7 @@ class PlanarGaussians(GaussianNetwork):
         self.deformation = Deformation(sphere, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W)."""
+        """Return spectra (B, H, W)."""
         move, stretch, turn, light = self._changes(tx, rx)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
@@ -138,13 +138,13 @@ def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
 
 
 def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
-    """Rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3) and the normal (N, 3)."""
+    """Return rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3) and the normal (N, 3)."""
     columns = torch.cat([axes, normal.unsqueeze(1)], 1).mT
     return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
 
 
 def turned_about_normal(frame: Tensor, half: Tensor) -> Tensor:
-    """Frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
+    """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()
     return torch.cat([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], -1)

@@ -69,7 +69,7 @@ class PowerField(ClosedForm):
 
     @classmethod
     def of(cls, site: Site, prior: Prior) -> PowerField:
-        """One of known settings, to be conditioned."""
+        """Return one of known settings, to be conditioned."""
         result = cls()
         result.site, result.priors = site, ((1.0, prior),)
         return result

@@ -51,7 +51,7 @@ class Blend:
     left: tuple[float, float]
 
     def at(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
-        """Shares (n,) of the solutions, and factors (n,) of the process's variance."""
+        """Return shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
         # Linear between the two distances that were measured, constant beyond either.
         there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
@@ -90,13 +90,13 @@ class Fringes:
         return torch.from_numpy(self.basis.mixture @ self.weights)
 
     def solutions(self, places: Tensor) -> Tensor:
-        """Powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
+        """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
         return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
 
     def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """A process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
+        """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
 
         Args:
             decibels: (n,) of the process.
@@ -108,7 +108,7 @@ class Fringes:
     def blended_unseen(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
-        """The same at rows (n,) by those solutions that never saw them or their surroundings."""
+        """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
         mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
@@ -119,7 +119,7 @@ class Fringes:
         return decibels + share * (mean - decibels), factor
 
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `fringes_of` needs."""
+        """Return tensors and numbers that `fringes_of` needs."""
         arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
         arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
         blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
@@ -128,7 +128,7 @@ class Fringes:
 
 
 def fringes_of(state: dict[str, Any]) -> Fringes:
-    """The fringes whose `state()` this was."""
+    """Return the fringes whose `state()` this was."""
     waves, mixture, weights, blind, rows, fold = (
         state[name].numpy() for name in ("waves", "mixture", "weights", "blind", "rows", "fold")
     )
@@ -155,7 +155,7 @@ def sampled(places: np.ndarray, wavelength: float | None) -> bool:
 
 
 def nearest(places: np.ndarray) -> np.ndarray:
-    """Distances (n,) of places (n, 3) from the nearest other [m]."""
+    """Return distances (n,) of places (n, 3) from the nearest other [m]."""
     return cKDTree(places).query(places, k=2)[0][:, 1]
 
 
@@ -167,7 +167,7 @@ def find_fringes(
     seed: int,
     budget: TimeBudget | None,
 ) -> tuple[Fringes | None, str]:
-    """Fringes where they pay beside a process, and what must be said of them.
+    """Return fringes where they pay beside a process, and what must be said of them.
 
     Args:
         rows: all heard.

@@ -31,7 +31,7 @@ class Gain:
 
 
 def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
-    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
+    """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
 
     Along the longer side of the places' box there are `sides` squares.
     """
@@ -43,7 +43,7 @@ def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
 
 def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """`count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
+    """Return `count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
     names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
     parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
     return [part for part in parts if len(part)]

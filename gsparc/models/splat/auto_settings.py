@@ -89,7 +89,7 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
 
 
 def settled(settings: ModelSettings, choices: Choices) -> ModelSettings:
-    """The settings with nothing left at `auto`."""
+    """Return the settings with nothing left at `auto`."""
     replace = dataclasses.replace
     encoding = replace(settings.emission.encoding, kind=choices.encoding)
     emission = replace(

@@ -146,7 +146,7 @@ class ImageProcess(LearnedField):
         return averaged(result, process, partial(mixed, weight=weight, site=self.site))
 
     def size(self) -> int:
-        """Number of Gaussians."""
+        """Return the number of Gaussians."""
         return 0 if self._alone else super().size()
 
     @property
@@ -170,7 +170,7 @@ class ImageProcess(LearnedField):
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Field, averaged process, and what was found out."""
+        """Return the field, averaged process, and what was found out."""
         beside = None
         if self._average is not None:
             method, weight = self._average

@@ -74,7 +74,7 @@ def _weights(model: GaussianModel, rx: Pose) -> Tensor:
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The field with what `settings` spare left out; the trained one stays as it is.
+    """Return the field with what `settings` spare left out; the trained one stays as it is.
 
     Args:
         method: fitted.
@@ -141,7 +141,7 @@ def _keep(model: GaussianModel, rows: Tensor) -> None:
 
 
 def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
-    """Rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
+    """Return rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
 
     Each is the one farthest from all before it. What is kept is taught anew, so places count, not strengths:
     an eighth of 2,000 Gaussians chosen by contribution leaves holes.

@@ -33,7 +33,7 @@ class SearchResult:
     noise: Tensor
 
     def features(self, mean: Tensor, aperture: Aperture) -> Tensor:
-        """Features (B, 10) of the error at an aperture with predicted channels `mean` (B, A, K).
+        """Return features (B, 10) of the error at an aperture with predicted channels `mean` (B, A, K).
 
         Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation, number
         and delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
@@ -82,7 +82,7 @@ class RelativeErrorRegression:
     smearing: float
 
     def expected(self, features: Tensor) -> Tensor:
-        """Expected relative error |e|^2 / |h|^2 (B,) for features (B, S)."""
+        """Return the expected relative error |e|^2 / |h|^2 (B,) for features (B, S)."""
         logarithm = _quadratic((features - self.middle) / self.scale) @ self.weights
         return self.smearing * 10 ** logarithm.clamp(self.low, self.high)
 
@@ -111,7 +111,7 @@ def _quadratic(x: Tensor) -> Tensor:
 
 
 def estimate_noise(uplink: Tensor, aperture: Aperture, window: tuple[float, float]) -> Tensor:
-    """Noise power (B,) from delays without paths, for data that do not state theirs."""
+    """Return the noise power (B,) from delays without paths, for data that do not state theirs."""
     count = len(aperture.tones)
     # Without a taper side lobes of strong paths would be taken for noise.
     taper = torch.hann_window(count + 2, periodic=False)[1:-1].to(uplink.real)

@@ -54,12 +54,12 @@ class Sources:
         return variance[:, -self.delay.shape[1] :].clamp_min(0)
 
     def response(self, aperture: Aperture) -> Tensor:
-        """Channels (B, A, K) complex64."""
+        """Return channels (B, A, K) complex64."""
         over_antennas, over_tones = steering(self.direction, aperture), delays(self.delay, aperture)
         return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
 
     def error_variance(self, aperture: Aperture) -> Tensor:
-        """Expected squared error per entry (B,) of `response`, to first order in the places."""
+        """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
         count = self.gain.shape[1]
         gram = Columns.of(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real

@@ -48,7 +48,7 @@ def evolve(
 def find_box(
     left: Unexplained, draws: int = 1000, parents: int = 12, seeds: Tensor | None = None
 ) -> tuple[Tensor, float]:
-    """The box (6,) whose shadow explains most, and its gain [nats].
+    """Return the box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
         left: what a shadow may explain.
@@ -73,7 +73,7 @@ def find_box(
 
 
 def inside_out(boxes: Tensor, room: Tensor) -> Tensor:
-    """Boxes (m, 6) cut to the room, their corners in order."""
+    """Return boxes (m, 6) cut to the room, their corners in order."""
     low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
     return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
 

@@ -88,7 +88,7 @@ class SmallMirror:
 
 
 def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
-    """At most so many small mirrors parallel to walls, best first.
+    """Return at most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
     and before each wall) are collected in a raster of where it is met; integral images give every rectangle.

@@ -59,11 +59,11 @@ class ReflectionPhasePrior:
         return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
     def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Phases (K,) of sequences, given the transmitter's own."""
+        """Return phases (K,) of sequences, given the transmitter's own."""
         return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
 
     def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Negative log prior of phases (K,), the transmitter's first."""
+        """Return the negative log prior of phases (K,), the transmitter's first."""
         return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
 
 
@@ -75,7 +75,7 @@ def descend(
     soft: float,
     phase_prior: ReflectionPhasePrior,
 ) -> Scene:
-    """The most likely scene of `steps` steps; paths are those of the start."""
+    """Return the most likely scene of `steps` steps; paths are those of the start."""
     assert scene.phase is not None
     rows, old = residual.rows, scene.clutter
     start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)

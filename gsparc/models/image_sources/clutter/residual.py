@@ -99,14 +99,14 @@ class Residual:
 
     # ---- the constant part ----
     def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
-        """Constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
+        """Return constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
         scaled = (self.waves if waves is None else waves) * (
             visible_share.T * log_amplitude.exp() * self.share
         )
         return self.root @ torch.cat([scaled.real, scaled.imag])
 
     def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
-        """Negative log likelihood (), in nats; differentiable."""
+        """Return the negative log likelihood (), in nats; differentiable."""
         return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
 
     def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
@@ -119,7 +119,7 @@ class Residual:
         return (0.5 * (mean.square() / spread + spread.log())).float()
 
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
-        """Scorer of candidates, with the constant parts at their posterior means removed."""
+        """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
         own = Factor.of(inner)
@@ -151,7 +151,7 @@ class CandidateScorer:
         return self.root.square().sum(0).view(2, -1).mean(0)
 
     def score(self, change: Tensor) -> Tensor:
-        """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
+        """Return nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
         return self.score_positive(change)[0]
 
     def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ class CandidateScorer:
         return torch.cat(scores)
 
     def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and the multiples (M,)."""
+        """Return the same, and the multiples (M,)."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
@@ -174,7 +174,7 @@ class CandidateScorer:
         return multiple * matched / 2, multiple
 
     def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
-        """Nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
+        """Return nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
         parts = [self.root @ part for part in stacked(waves)]
         seen = [self.projection @ part for part in parts]
         dot = [

@@ -75,7 +75,7 @@ class Mirrors:
         return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
 
     def mirroring(self, smallest: float) -> list[int]:
-        """Numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
+        """Return numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
 
         Others only block.
         """
@@ -93,7 +93,7 @@ class Mirrors:
     def visible_sequences(
         self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool
     ) -> tuple[Reflections, ...]:
-        """At most `most` sequences, the static end's own first, then by power expected at the places.
+        """Return at most `most` sequences, the static end's own first, then by power expected at the places.
 
         Args:
             indices: planes that mirror, the largest first.
@@ -169,7 +169,7 @@ class Mirrors:
 
 
 def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
-    """Walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
+    """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()

@@ -82,7 +82,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
 
 
 def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
-    """The same by sites; places (n, 7) say which station a row is of."""
+    """Return the same by sites; places (n, 7) say which station a row is of."""
     places = np.concatenate([rows.places[:, :6], rows.station[:, None]], 1)
     return replace(rows, places=places, station=network.site.numpy()[rows.station])
 
@@ -90,7 +90,7 @@ def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
 def learn_network(
     rows: LinkRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
 ) -> tuple[Prior, list[str]]:
-    """The prior of every site of a network, and what must be said of it.
+    """Return the prior of every site of a network, and what must be said of it.
 
     Args:
         rows: by sites, see `by_site`.
