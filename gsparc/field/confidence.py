@@ -61,11 +61,11 @@ class ErrorModel(nn.Module):
         return share * self.far, share
 
     def get_extra_state(self) -> Tensor:
-        """For `state_dict`."""
+        """Return what `state_dict` holds beside tensors."""
         return torch.tensor([self.far, self.power], dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """From `state_dict`."""
+        """Read what `state_dict` held beside tensors."""
         self.far, self.power = (float(value) for value in state)
 
 

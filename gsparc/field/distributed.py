@@ -53,14 +53,14 @@ class Processes(DDPStrategy):
         torch.set_num_threads(max(1, self.threads // self.num_processes))
 
     def configure_ddp(self) -> None:
-        """Nothing is wrapped; all begin with the first process's numbers."""
+        """Wrap nothing; all begin with the first process's numbers."""
         assert self.lightning_module is not None
         for tensor in self.lightning_module.state_dict().values():
             distributed.broadcast(tensor, 0)
 
     @contextmanager
     def block_backward_sync(self) -> Iterator[None]:
-        """While gradients of several batches are added up for one step."""
+        """Hold sums back while gradients of several batches are added up for one step."""
         self._accumulating = True
         try:
             yield
@@ -68,7 +68,7 @@ class Processes(DDPStrategy):
             self._accumulating = False
 
     def post_backward(self, closure_loss: Tensor) -> None:
-        """Before gradients are unscaled, clipped and used."""
+        """Sum gradients, before they are unscaled, clipped and used."""
         if not self._accumulating:
             assert self.lightning_module is not None
             add_up(p for p in self.lightning_module.parameters() if p.requires_grad)

@@ -28,7 +28,7 @@ class Edit:
 
 
 def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
-    """Every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
+    """Return every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
     rows = {}
     for name, module in root.named_modules():
         if not getattr(module, "per_gaussian", False):

@@ -78,7 +78,7 @@ class GaussianField(nn.Module):
 
     @torch.no_grad()
     def cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
-        """As a picture or a file needs them, with what each emits (N,), in the unit of `label`."""
+        """Return what a picture or a file needs, with what each emits (N,), in the unit of `label`."""
         means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
         quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
         return GaussianCloud(means, scales, quats, opacities, strengths.double().numpy(), label)

@@ -60,7 +60,7 @@ class KeepBest(L.Callback):
             log.info("gradient steps: %d looks without a sure gain, training ends", self.looks)
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Back to the best; also after a checkpoint with every step done."""
+        """Go back to the best; also after a checkpoint with every step done."""
         if self._kept is None:
             return
         trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process

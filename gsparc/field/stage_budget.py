@@ -35,7 +35,7 @@ class Budget(L.Callback):
             trainer.should_stop = True
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        """Of several processes each has a processor time of its own."""
+        """Count in another process, whose processor time is its own."""
         if os.getpid() != self._process:
             self.budget.moved()
 

@@ -131,7 +131,7 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Of what was measured in rows (n, A, K), (n,)."""
+    """Root mean square (n,) of what was measured in rows (n, A, K)."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
     return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
 
@@ -190,7 +190,7 @@ class _Rows:
         return "phase" if self.freedom == "phase" else "phase+delay"
 
     def smooth(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by a process of two lengths; of its rounds the one that tells rows best."""
+        """Go on from these factors by a process of two lengths; return the round that tells rows best."""
         kernel, found = first_kernel(self.length, spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
@@ -200,7 +200,7 @@ class _Rows:
         return min(found, key=lambda each: each.error)
 
     def waves(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by waves from everywhere alike."""
+        """Go on from these factors by waves from everywhere alike."""
         # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
         weights = self._weights(Kernel((waves,), WAVE_NOISE))

@@ -34,7 +34,7 @@ class LearnsTogether(MethodFactory):
     init: InitSettings
 
     def shares(self, site: Site) -> bool:
-        """Received powers, and channels of a known carrier with its phases."""
+        """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
 

@@ -90,7 +90,7 @@ def fit(
 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
-    """For the `extra` of a finished part's checkpoint: what `fit` compares, and the report."""
+    """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.of(data, fold, context).marks()}
@@ -146,13 +146,13 @@ class Origin:
 
     @classmethod
     def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
-        """Of a fit that begins."""
+        """Return the origin of a fit that begins."""
         directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
         auxiliary = content_hash({**directions, "uplink": data.uplink})
         return cls(data.site, auxiliary, indices_hash((fold,)), context.seed, context.config_yaml)
 
     def marks(self) -> dict[str, Any]:
-        """For the `extra` of a checkpoint, which holds the configuration itself."""
+        """Return what a checkpoint has as `extra`; it holds the configuration itself."""
         return {"origin": {**self._hashes(), "seed": self.seed}}
 
     def _hashes(self) -> dict[str, str]:

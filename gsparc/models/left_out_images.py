@@ -39,12 +39,12 @@ class LeftOut:
     predicted: np.ndarray
 
     def state(self) -> dict[str, Tensor]:
-        """For the checkpoint of a training that may be interrupted."""
+        """Return what the checkpoint of a training that may be interrupted stores."""
         return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in vars(self).items()}
 
     @classmethod
     def of(cls, state: Mapping[str, Tensor] | None) -> LeftOut | None:
-        """From `state()`; None from None."""
+        """Return what had this `state()`; None of None."""
         return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
     def by_process(self) -> np.ndarray:

@@ -150,7 +150,7 @@ class MeanOnly(View):
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
-    """Every `stride`-th pixel of the grid, the first row and column among them.
+    """Return every `stride`-th pixel of the grid, the first row and column among them.
 
     Raises:
         ValueError: the columns cannot be divided so.

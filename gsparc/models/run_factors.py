@@ -34,7 +34,7 @@ class RunFactors:
 
     @staticmethod
     def none() -> RunFactors:
-        """Of channels that are all in phase."""
+        """Return the factors of channels that are all in phase."""
         return RunFactors(np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128))
 
     @staticmethod
@@ -77,7 +77,7 @@ class RunFactors:
 
     @staticmethod
     def read(state: dict[str, Tensor] | None) -> RunFactors:
-        """Inverse of `state`; `none` of None."""
+        """Make what had this `state`; `none` of None."""
         return RunFactors.none() if state is None else RunFactors(state["runs"].numpy(), state["factors"])
 
 

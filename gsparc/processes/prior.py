@@ -80,7 +80,7 @@ class Posterior(ABC):
     @property
     @abstractmethod
     def places(self) -> Tensor:
-        """Of the rows (n, D) float64 [m]."""
+        """Places of the rows (n, D) float64 [m]."""
 
     @abstractmethod
     def answer(self, queries: Tensor, exact: bool = False) -> Answer:

@@ -78,7 +78,7 @@ NOTHING = Spent()
 
 
 def less_repeatable(*clocks: Clock | None) -> Clock | None:
-    """Of clocks that decided something, the one whose seconds repeat a result worst; None of none."""
+    """Of clocks that decided something, return the one whose seconds repeat results worst; None of none."""
     return "wall" if "wall" in clocks else next(filter(None, clocks), None)
 
 
@@ -113,7 +113,7 @@ class TimeBudget:
 
     @property
     def counted(self) -> Spent:
-        """By both clocks."""
+        """Seconds by both clocks."""
         return self._before if self._since is None else self._before + (self._now() - self._since)
 
     @property

@@ -35,7 +35,7 @@ class Part(Logger):
     version = property(lambda self: self.whole.version)
 
     def log_hyperparams(self, *unused: Any, **named: Any) -> None:
-        """Nothing: the run's are said once."""
+        """Log nothing: the run's are said once."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log figures under the part's name."""

@@ -50,7 +50,7 @@ MASS, VARIANCE = _moment(CORNER)
 
 
 def law_variance(law: Law) -> float:
-    """Of a measurement about the law [dB^2]."""
+    """Return the variance of a measurement about the law [dB^2]."""
     return law.scale**2 * VARIANCE
 
 

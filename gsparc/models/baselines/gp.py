@@ -152,7 +152,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return (*notes, *thinned)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
+        """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
@@ -225,7 +225,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Nothing: what a component contributes stands in the process."""
+        """Return nothing: what a component contributes stands in the process."""
         return {}
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:

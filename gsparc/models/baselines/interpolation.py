@@ -88,7 +88,7 @@ class Interpolator(Method):
 
     @property
     def kind(self) -> Kind:
-        """Of the targets that were learned."""
+        """Kind of the targets that were learned."""
         assert self.site is not None
         return self.site.kind
 
@@ -97,7 +97,7 @@ class Interpolator(Method):
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+        """Learn positions (n, 3) float64 [m] and stored targets (n, ...); return notes for the report."""
 
     def _learn_censored(
         self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
@@ -113,7 +113,7 @@ class Interpolator(Method):
         return {name: getattr(self, name) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        """Inverse of what `stored` names; what cannot be stored is made again by who overrides this."""
+        """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
             setattr(self, name, state[name])
 

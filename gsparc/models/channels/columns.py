@@ -65,7 +65,7 @@ class Slot:
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Slot:
-        """Inverse of `state`."""
+        """Make the slot whose `state` this was."""
         end = state["end"] if len(state["end"]) else torch.full((3,), math.nan, dtype=torch.float64)
         entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
         return cls(**{**state, **entries, "end": end})
@@ -126,7 +126,7 @@ class Group(At):
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Group:
-        """Inverse of `state`."""
+        """Make the group whose `state` this was."""
         return cls(**{**state, "slot": Slot.read(state["slot"])})
 
     @cached_property

@@ -31,7 +31,7 @@ class Common:
 
     @staticmethod
     def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
-        """From groups, their inverse covariances times targets (n, D), and scales."""
+        """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
             waves, power, away = _waves(prior, group)

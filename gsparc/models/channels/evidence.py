@@ -130,7 +130,7 @@ def without(part: Compressed, left: Tensor) -> Compressed:
 
 
 def solved(part: Compressed, power: Tensor) -> Solved:
-    """With its own powers (P,)."""
+    """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
     powers = power[:-1].split([piece.count for piece in part.pieces])
@@ -165,7 +165,7 @@ def evidence(parts: tuple[Compressed, ...], prior: ChannelPrior) -> float:
 def fit_powers(
     parts: tuple[Compressed, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
 ) -> tuple[ChannelPrior, float]:
-    """With parameters of largest evidence, its negative logarithm without the priors.
+    """Fit parameters of largest evidence; return its negative logarithm without the priors too.
 
     Args:
         parts: of the groups.

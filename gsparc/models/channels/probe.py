@@ -45,7 +45,7 @@ class Probe:
 
     @staticmethod
     def of(part: Compressed, prior: ChannelPrior) -> Probe:
-        """With the group's own powers."""
+        """Factor a group's covariance with its own powers."""
         at, basis, noise = solved(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
@@ -70,7 +70,7 @@ class Probe:
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
 
     def added(self, wave: Tensor, level: float) -> Probe:
-        """With a wave (n,) of some power among the terms."""
+        """Return the probe with a wave (n,) of some power among the terms."""
         own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
         own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
         share = level / (1 + level * float((wave.conj() @ own).real))

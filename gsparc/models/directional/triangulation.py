@@ -52,7 +52,7 @@ class Rays:
 
     @staticmethod
     def of(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
-        """From one array (paths, 3) per receiver."""
+        """Gather one array (paths, 3) per receiver."""
         flat = np.concatenate([np.zeros((0, 3)), *rays])
         flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
         return Rays(places, flat, np.repeat(np.arange(len(rays)), [len(r) for r in rays]))

@@ -49,7 +49,7 @@ class VisibilityGP:
 
     @staticmethod
     def of(places: Tensor, seen: Tensor) -> VisibilityGP:
-        """From the visibility of K sources at n receivers."""
+        """Learn from the visibility of K sources at n receivers."""
         apart, mean = torch.cdist(places, places), seen.mean(0)
         length, weights = torch.full_like(mean, LENGTHS_M[-1]), torch.zeros_like(seen)
         left_out = mean.expand_as(seen).clone()  # without a better kernel the mean
@@ -105,7 +105,7 @@ class RayErrorRates:
 
     @staticmethod
     def of(rays: Tensor, seen: Tensor) -> RayErrorRates:
-        """From rays and visibility, both (n, K) of zeros and ones."""
+        """Estimate from rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
         return RayErrorRates(max(missed, MIN_RATE), max(spurious, MIN_RATE))

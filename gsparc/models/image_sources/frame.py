@@ -71,7 +71,7 @@ class Frame:
         return places.flatten(0, 1), len(query)
 
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
-        """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
+        """Turn normalised predictions (n, R) of the rows back; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
         # NaN: who needs a variance takes that of a prediction at the place.
         unknown = torch.full((len(predicted),), float("nan"))

@@ -150,14 +150,14 @@ class Posterior:
         return self.scene.waves(self.rows)
 
     def gains(self) -> CircularGains:
-        """Of no source yet."""
+        """Return the covariance of no source yet."""
         if self.scene.phase is None:
             return CircularGains(self.rows)
         return PhasedGains(self.rows, self.scene.quadrature)
 
     @cached_property
     def summed(self) -> CircularGains:
-        """Of all sources, without noise until it is `given`."""
+        """Covariance of all sources, without noise until it is `given`."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
@@ -170,7 +170,7 @@ class Posterior:
 
     @property
     def covariance(self) -> Tensor:
-        """Of the rows, noise included."""
+        """Covariance of the rows, noise included."""
         # The noise is added to the sums when they are first conditioned.
         assert self.conditioned
         return self.summed.matrix

@@ -52,18 +52,18 @@ class KernelVisibility:
 
     @staticmethod
     def of(value: Tensor) -> KernelVisibility:
-        """From the logit of `constant` and the logarithms of both lengths; differentiable."""
+        """Make it from the logit of `constant` and the logarithms of both lengths; differentiable."""
         return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
 
     def parameters(self, least: float, *shares: float) -> Tensor:
-        """Inverse of `of`, then the logits of more `shares`; all shares are at least `least`."""
+        """Return what `of` reads, then the logits of more `shares`; all shares are at least `least`."""
         # A logit has no value at 0 and 1, and hardly a slope near them.
         clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
         return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
 
     def plain(self) -> KernelVisibility:
-        """With numbers instead of tensors."""
+        """Return it with numbers instead of tensors."""
         return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
 
 

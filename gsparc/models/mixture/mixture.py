@@ -205,7 +205,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return explained(own, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Every member on the same rows."""
+        """Condition every member on the same rows."""
         for member in self.members:
             member.condition(data, rows)
 

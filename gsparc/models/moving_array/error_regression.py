@@ -106,7 +106,7 @@ class ErrorRegression(WithKernel):
 def fit_errors(
     places: np.ndarray, relative_error: Tensor, features: Tensor, kernel: Kernel, reach: float, prior: float
 ) -> ErrorRegression:
-    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
+    """Fit leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
 
     `kernel`, `reach` and `prior` are `ErrorRegression`'s.
     """

@@ -136,7 +136,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("searches", *own) if len(self.trends) > 1 else own
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Nothing: the process itself holds what each component contributes."""
+        """Return nothing: the process itself holds what each component contributes."""
         return {}
 
     reduced = reduced

@@ -43,7 +43,7 @@ class WithKernel:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
-        """Inverse of `state`."""
+        """Make what had this `state`."""
         return cls(**{**state, "kernel": Kernel.read(state["kernel"])})
 
 

@@ -38,11 +38,11 @@ class Residual(WithKernel):
     weights: Tensor
 
     def coefficients(self, far: Tensor) -> Tensor:
-        """Of images (m, R) at places that are `far` (m, n) [m] from the training receivers."""
+        """Return coefficients (m, R) of images at places `far` (m, n) [m] from the training receivers."""
         return torch.addmm(self.mean, self.kernel.correlation(far) @ self.weights, self.axes)
 
     def first(self, count: int) -> Residual:
-        """With the `count` axes that most is predicted along."""
+        """Return the process with the `count` axes that most is predicted along."""
         return Residual(self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous())
 
 

@@ -272,7 +272,7 @@ def _blend(
 
 
 def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np.ndarray) -> float:
-    """Of what leads from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
+    """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
     Rows of one group err together and count as one.
     """

@@ -105,7 +105,7 @@ class Candidate:
 def candidates(
     rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
 ) -> list[Candidate]:
-    """Of each mean law the likeliest settings, the best first, then those of kriging.
+    """Return the likeliest settings of each mean law, the best first, then those of kriging.
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """

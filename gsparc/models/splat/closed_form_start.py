@@ -61,7 +61,7 @@ class Process:
 
 
 def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
-    """Of training rows (n,), at up to `anchors` places."""
+    """Learn a process of training rows (n,), at up to `anchors` places."""
     _, kernel = _kernel(data, rows, anchors, seed)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
@@ -96,7 +96,7 @@ class Seen:
     attenuation: Tensor | None
 
     def at(self, rows: np.ndarray) -> Seen:
-        """Of some rows (m,) alone."""
+        """Return the process of some rows (m,) alone."""
         attenuation = None if self.attenuation is None else self.attenuation[rows]
         return Seen(self.weights, self.images[rows], self.outputs[rows], attenuation)
 

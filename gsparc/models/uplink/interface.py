@@ -54,7 +54,7 @@ class UplinkMethod(Method):
         return "predictions follow from an uplink, not from a position"
 
     def own(self, uplink: Tensor) -> Tensor:
-        """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""
+        """Return those of uplinks (B, U, L) that are heard by the antennas that answer, (B, A, L)."""
         assert self.site is not None
         return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
 

@@ -44,12 +44,12 @@ class Sources:
 
     @property
     def variance(self) -> Tensor:
-        """Of the gains (B, N), given directions and delays."""
+        """Variance of the gains (B, N), given directions and delays."""
         return torch.diagonal(self.gain_covariance, dim1=1, dim2=2).real.clamp_min(0)
 
     @property
     def delay_variance(self) -> Tensor:
-        """Of the delays (B, N), turns^2 per tone^2."""
+        """Variance of the delays (B, N), turns^2 per tone^2."""
         variance = torch.diagonal(self.position_covariance, dim1=1, dim2=2)
         return variance[:, -self.delay.shape[1] :].clamp_min(0)
 
@@ -221,7 +221,7 @@ class _Fit:
     gain_slopes: Tensor
 
     def variance(self, noise: Tensor) -> Tensor:
-        """Of the gains (B, N)."""
+        """Return the variance of the gains (B, N)."""
         return noise[:, None] * torch.diagonal(self.inverse, dim1=1, dim2=2).real
 
 

@@ -43,7 +43,7 @@ class ReflectionPhasePrior:
 
     @staticmethod
     def of(scene: Scene) -> ReflectionPhasePrior:
-        """From a scene's phases, weighted by power."""
+        """Estimate from a scene's phases, weighted by power."""
         assert scene.phase is not None
         order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
         # Three phases lie near 0 or pi by chance.

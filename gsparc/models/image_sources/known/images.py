@@ -87,7 +87,7 @@ class Mirrors:
         return sorted(size, key=lambda plane: -size[plane])
 
     def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Paths:
-        """From places (n, 3) to the transmitter (3,) float64 [m]."""
+        """Return the paths from places (n, 3) to the transmitter (3,) float64 [m]."""
         return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
     def visible_sequences(

@@ -115,7 +115,7 @@ class Terms:
 
     @classmethod
     def over(cls, rows: LinkRows, trend: Trend, length: float, places: int, seed: int) -> Terms:
-        """With g of 0 dB, known at so many places of rows, drawn evenly."""
+        """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
         none = torch.zeros(0, 3, dtype=torch.float64)
         bare = cls(trend, float(decades.min()), float(decades.max()), none, length)
