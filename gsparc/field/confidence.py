@@ -55,7 +55,7 @@ class ErrorModel(nn.Module):
         self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
 
     def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
-        """Variance (B,) of unknown shares (B,), and its share (B,) of what is expected far from all data."""
+        """Return variances (B,) of unknown shares (B,), and their shares (B,) of those far from all data."""
         one = ONE.to(unknown.dtype)
         share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
         return share * self.far, share
@@ -121,7 +121,7 @@ class Confidence(nn.Module):
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
     def normalised(self, position: Tensor) -> Tensor:
-        """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data.
+        """Return the confidence in [0, 1] (B,): C between its least and largest on the calibration data.
 
         It decays outside the box of what was measured, where the network's lines run on unchecked.
         """

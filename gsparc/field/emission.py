@@ -85,7 +85,7 @@ class Emission(nn.Module):
         return networks(encoded, self.weight1, self.bias1, self.weight2, self.bias2)
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
-        """Emission (B, N, C) at position (B, 3) [m]; distance (B, N) is d_i / d_ref, without unit (eq. 1)."""
+        """Return emissions (B, N, C) at positions (B, 3) [m]; distance (B, N) is d_i / d_ref (eq. 1)."""
         logits = self.logits(position)
         if self.settings.log_distance:
             logits = logits.sub_(distance.log().unsqueeze(-1))

@@ -175,7 +175,7 @@ class GaussianModel(nn.Module):
 
     @torch.autocast("cpu", enabled=False)
     def unknown(self, tx: Tensor, rx: Pose) -> Tensor | None:
-        """Share f^2 (B,) of the field's variance that is unknown; None where features do not tell."""
+        """Return unknown shares f^2 (B,) of the field's variance; None where features do not tell."""
         if not self.tells_unknown:
             return None
         return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))

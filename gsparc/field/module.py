@@ -81,7 +81,7 @@ class NetworkModule(L.LightningModule):
         return self.model(batch.tx, batch.rx)
 
     def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss () of a step on a batch, and the task's of each sample (B,), where these are told apart."""
+        """Return the loss () of a step on a batch, and the task's of each sample (B,) where told apart."""
         # Draws are a pure function of (seed, step): a resumed run goes on with the same.
         draw = torch.Generator().manual_seed(torch.initial_seed() + self.global_step)
         loss = self.model.loss(batch, draw)

@@ -54,7 +54,7 @@ class OptimizerSettings(Checked):
         return replace(self, **shares, warmup=max(self.warmup, round(WARMUP * total)))
 
     def rate_of(self, name: str) -> tuple[str, float]:
-        """Kind and initial rate of a parameter by its dotted name; `KeyError` where none is declared."""
+        """Return a parameter's kind and initial rate by dotted name; `KeyError` where none is declared."""
         kind = kind_of(name)
         return kind, getattr(self, kind)
 
@@ -72,7 +72,7 @@ KINDS = {
 
 
 def kind_of(name: str) -> str:
-    """Which rate a parameter follows, from its dotted name; `KeyError` when none is declared for it."""
+    """Return which rate a parameter follows, by dotted name; `KeyError` where none is declared."""
     for prefix, kind in KINDS.items():
         if name == prefix or name.startswith(prefix + "."):
             return kind

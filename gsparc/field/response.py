@@ -130,7 +130,7 @@ class ArrayResponse(nn.Module):
         return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
 
     def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
-        """Published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if there are any.
+        """Return published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if any.
 
         Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no
         maximum of 1 to be divided by.

@@ -48,7 +48,7 @@ class LeftOut:
         return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
     def by_process(self) -> np.ndarray:
-        """The same samples (g, c, P) as a Gaussian process on images predicts them from what is left."""
+        """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
         # Left singular vectors times singular values are scores in an orthonormal basis.
@@ -63,7 +63,7 @@ class LeftOut:
         return predicted[gap][seen], self.images[self.centres][seen]
 
     def as_far_as(self, distance: float | None) -> int:
-        """The gap whose held-out samples are most nearly `distance` [m] from what is left, by medians.
+        """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.
 
         Args:
             distance: of rows held out of the fit to the nearest row in it; None: no gap at all.

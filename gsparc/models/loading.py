@@ -63,7 +63,7 @@ def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
 
 
 def module_of(path: str | Path) -> GaussianModule:
-    """The LightningModule of a `model.ckpt` or `last.ckpt` whose method is a splatted field, on the CPU.
+    """Return the LightningModule in a `model.ckpt` or `last.ckpt` of a splatted field, on the CPU.
 
     Raises:
         CheckpointError: unreadable, or another method's.

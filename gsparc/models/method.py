@@ -100,7 +100,7 @@ class MethodFactory(ABC):
     def best_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
-        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
+        """Return how several stations are best learned, and why, one line; "" if nothing was to decide."""
         return "each", ""
 
 
@@ -170,7 +170,7 @@ class Method(MethodFactory):
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Tensors, numbers and strings that `restore` needs (weights-only unpickling must accept them)."""
+        """Return tensors, numbers and strings that `restore` needs, as weights-only unpickling accepts."""
 
     @abstractmethod
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -231,7 +231,7 @@ def predictions(
 
 @contextmanager
 def suited_threads(method: Method, places: int) -> Iterator[None]:
-    """As many CPU threads as suit a query: one for a single place, where parts of it are too small to share.
+    """Run with as many CPU threads as suit a query: one for a single place, whose parts are small.
 
     On a busy machine two threads that wait for each other take up to a hundred times as long.
     """
@@ -276,7 +276,7 @@ class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
+        """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
 
         Raises:
             ValueError: what was fitted here has none.

@@ -86,7 +86,7 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
 
 
 def cost_of_halving(latency: Iterable[float], score: Iterable[float]) -> float | None:
-    """What each halving of the latency costs along a front, its least-squares slope [score per halving].
+    """Return what each halving of the latency costs along a front, by least squares [score per halving].
 
     Args:
         latency, score: of the front's points.

@@ -262,7 +262,7 @@ class PerStation(Method):
         return OfStation(copy, number) if self._shared else copy
 
     def every(self) -> OfStations | None:
-        """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
+        """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
         return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
@@ -315,7 +315,7 @@ class PerStation(Method):
         return sum(copy.size() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
-        """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
+        """Sum over copies what counts or costs, and average shares; initialisers of all are named."""
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()

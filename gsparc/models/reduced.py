@@ -64,7 +64,7 @@ class ReducedByPart(Method):
 def combinations(
     method: Method, grid: Mapping[str, Sequence[Any] | None], singles: Mapping[str, Sequence[Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Settings: none, each of `singles` alone, and every combination in `grid`, of the knobs the method has.
+    """Yield settings: none, each of `singles` alone, all combinations in `grid`, of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.
     """
@@ -223,7 +223,7 @@ class Blended(View):
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:
-    """The process without its variance, which costs most of its answer and which the field has of its own."""
+    """Return the process without its variance, most of its cost, which the field has of its own."""
     return reduced(process, {"confidence": False, **(settings or {})}, {})
 
 

@@ -65,7 +65,7 @@ def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds:
 
 
 def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:
-    """Posterior means of errors (P, 3) [m], and what errors of this size gain in log density [nats].
+    """Return posterior means of errors (P, 3) [m], and what errors of this size gain [nats].
 
     Args:
         seen: n rows.

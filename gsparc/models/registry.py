@@ -34,7 +34,7 @@ def known() -> dict[str, str]:
 
 
 def method_class(name: str) -> type[MethodFactory]:
-    """What makes the method called `name`; `ValueError` with the nearest right name when there is none."""
+    """Return what makes the method `name`; `ValueError` with the nearest right name if there is none."""
     if name in methods():  # before plugins, whose entry points take milliseconds to read
         return get_class(methods()[name])
     there = known()

@@ -82,7 +82,7 @@ class RunFactors:
 
 
 def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """What rows must be multiplied by to belong to the largest run, (runs,) complex128 of largest likelihood.
+    """Return what rows are multiplied by to belong to the largest run, (runs,) complex128, by likelihood.
 
     Args:
         inverse: (n, n) inverse of the rows' covariance.
@@ -100,7 +100,7 @@ def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> n
 
 
 def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The factors (runs,) from M (runs, runs), of one process or summed over many, and each run's numbers.
+    """Return factors (runs,) from M (runs, runs), of one process or summed over many, and runs' sizes.
 
     Args:
         size: (runs,) complex numbers measured in each, above 0; the largest has factor 1.

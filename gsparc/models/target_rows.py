@@ -16,7 +16,7 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
+    """Return targets of `rows` in stored type and units; unmeasured entries are means of other rows.
 
     Many large ones of a file stay on disk. Rows of which only a level is known (`data.censored`) keep it.
 
@@ -56,7 +56,7 @@ def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
 
 
 def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
-    """Variance (B,) per real number of `to_real` as expected squared error (B,) per entry of the target.
+    """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry.
 
     Complex entries hold two real numbers; decibels are carried to linear power to first order.
     """
@@ -68,12 +68,12 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
 
 
 def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Those of rows (n,) where something was heard, in their order; a saturated one counts as its level."""
+    """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
     return rows[data.side(rows) <= 0]
 
 
 def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
-    """What a reader must know of a fit to `heard(data, rows)`; nothing where all of rows (n,) were heard."""
+    """Say what a fit to `heard(data, rows)` left out; nothing where all of rows (n,) were heard."""
     side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))

@@ -24,7 +24,7 @@ TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """The vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
+    """Return vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
 
     Args:
         partner: (M,) index of each element's mirror element.
@@ -33,7 +33,7 @@ def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
 
 
 def mirror_elements(array: np.ndarray) -> np.ndarray | None:
-    """(M,) index of each element's reflection through the array's centre; None for an asymmetric array."""
+    """Return indices (M,) of elements reflected through the array's centre; None of an asymmetric one."""
     centred = array - array.mean(0)
     distance = cdist(centred, -centred)
     partner = distance.argmin(1)
@@ -92,7 +92,7 @@ def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray
 def matched(
     vector: np.ndarray, expected: np.ndarray, partner: np.ndarray | None, margin: float = 1.0
 ) -> np.ndarray:
-    """A vector (M,), or its twin whose overlap with the expected one is larger by a margin, in its phase."""
+    """Return a vector (M,), or its twin if that overlaps more with the expected one, in its phase."""
     overlap = np.vdot(vector, expected)
     if partner is not None:
         other = twin(vector, partner)
@@ -146,7 +146,7 @@ def aligned_to(
     vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
     partner: np.ndarray | None, kernel: Kernel,
 ) -> np.ndarray:  # fmt: skip
-    """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
+    """Return vectors (m, M) complex128 of the phases and twins likeliest given the nearest of aligned ones.
 
     Args:
         vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.

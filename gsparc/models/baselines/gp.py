@@ -269,7 +269,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 def projected(
     targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
 ) -> tuple[np.ndarray, float]:
-    """Scores (n, P) float32 of stored targets (n, ...), and the mean square per real number beyond them.
+    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond them.
 
     `block` targets are floats at a time.
     """
@@ -284,7 +284,7 @@ def projected(
 def kernel_given_nearest(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
-    """Length and noise most likely given the nearest rows, by the strongest components, and a note.
+    """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
 
     Args:
         places, scores: (n, D) [m] and (n, P) float32.

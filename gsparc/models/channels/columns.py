@@ -54,13 +54,13 @@ class Slot:
         ).to(whole.dtype)
 
     def places(self, moving: Tensor, rotation: Tensor) -> Tensor:
-        """Places (B, 3) float64 [m] of this antenna; of the moving end (B, 3) and its turns (B, 3, 3)."""
+        """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3) and turns (B, 3, 3)."""
         if not self.element.any():
             return moving
         return moving + rotation @ self.element
 
     def state(self) -> dict[str, Any]:
-        """What `read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
+        """Return what `read` reads; a checkpoint holds finite numbers, so that an unknown place is none."""
         return {**vars(self), "end": self.end[:0] if self.end.isnan().any() else self.end}
 
     @classmethod
@@ -233,7 +233,7 @@ def carrier_of(site: Site, station: int) -> float:
 
 
 def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Moving and static ends' places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
+    """Return moving and static places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
 
     Where both ends move, the moving places are (B, 6).
     A static end that is not where any station stands is of station `NOBODY`.
@@ -264,7 +264,7 @@ def ends_of(groups: tuple[Group, ...]) -> int:
 def aligned(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """Factors of runs (runs,) complex128, as measured over the largest one's, and what groups say without.
+    """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
 
     Of several ends that share them phases alone: what a run has changed beside its phase is each end's own,
     and would be taken for a level of all.

@@ -103,7 +103,7 @@ def normalised(group: Group) -> Group:
 def compressed(
     groups: tuple[Group, ...], prior: ChannelPrior, cache: Cache | None = None
 ) -> tuple[Compressed, ...]:
-    """Signals of all groups; those of one set of displacements and one wavelength share the diffuse field's.
+    """Return signals of all groups; of one set of displacements and wavelength they share the basis.
 
     `cache` keeps matrices of places that further candidates and groups need again.
     """
@@ -222,7 +222,7 @@ def minimised(
 
 
 def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
-    """Errors (n, D) of rows left out with their group, of each grouping (Rasmussen and Williams 2006, 5.12).
+    """Return errors (n, D) of rows left out in groups, of each grouping (Rasmussen and Williams, 5.12).
 
     Powers (P,) are its own.
     """

@@ -82,7 +82,7 @@ def summed_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
     known: Callable[[Probe, Tensor], Tensor] = Probe.known,
 ) -> Tensor:  # fmt: skip
-    """Rise of the log likelihood (count, levels) of all groups; `waves` (m, n) of some numbers (m,)."""
+    """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
         for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
@@ -93,7 +93,7 @@ def summed_gains(
 
 
 def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
-    """The offset (3,) float64 [m] of largest likelihood on a grid that is refined, or None for none better.
+    """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """

@@ -74,7 +74,7 @@ class UncertainPositions:
 
 
 def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
-    """(K, n, 3) float64 [rad/m], gradients of the received phases by the sources' positions, up to a sign."""
+    """Return gradients (K, n, 3) float64 [rad/m] of received phases by sources' positions, up to a sign."""
     towards = points[:, None] - places[None]
     away = torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-3)
     hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
@@ -224,7 +224,7 @@ class ConditionalLikelihood:
         return torch.stack(best)
 
     def refined(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (m, 3) after Gauss-Newton steps under the best gain, and covariances (m, 3, 3)."""
+        """Return positions (m, 3) after Gauss-Newton steps at the best gain, and covariances (m, 3, 3)."""
         best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
         for _ in range(STEPS):
             step, _ = self._step(points)

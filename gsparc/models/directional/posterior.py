@@ -137,7 +137,7 @@ class SightedSources:
         return in_double(self.prepared())
 
     def prepared(self) -> SightedSources:
-        """Itself, with what all queries need; tensors made within the first might be for inference only."""
+        """Return itself, with what all queries need; what the first makes might be for inference only."""
         assert len(self.dual_weights) == len(self.rows)
         return self
 
@@ -163,7 +163,7 @@ class SightedSources:
         return replace(self, power=power, kernel=kernel)
 
     def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
-        """Geometry of places (m, 3) [m] and frequencies (m,) or () [Hz]; probability (m, K) where known."""
+        """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K) if known."""
         dtype = self.power.dtype
         probability = self.visibility.probability(places) if probability is None else probability
         retained = torch.zeros(0, len(places), len(self.rows), dtype=dtype)

@@ -65,7 +65,7 @@ class Rays:
         return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
-        """Squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
+        """Return squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
         ahead = points @ self.direction.T - np.einsum("nc,nc->n", self.places[self.owner], self.direction)
         away = np.linalg.norm(points[:, None] - self.places[None], axis=-1)
         return np.maximum(2 - 2 * ahead / np.maximum(away, 1e-9)[:, self.owner], 0.0)
@@ -116,7 +116,7 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
 
 
 def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
-    """Expectation maximisation over points and rays, without duplicates and points of too little evidence."""
+    """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
     while True:
         covariance, responsibility = np.zeros((0, 3, 3)), np.zeros((0, len(rays)))
         rate: np.ndarray | float = 1.0

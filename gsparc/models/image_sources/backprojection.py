@@ -108,7 +108,7 @@ def pick_apart(
     position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0,
     known: Tensor | None = None,
 ) -> list[int]:  # fmt: skip
-    """Indices of the best scores (n,) of at least `threshold`, positions (n, 3) `min_distance` [m] apart.
+    """Return indices of the best scores (n,) of at least `threshold`, `min_distance` [m] apart by positions.
 
     Also from those that are `known` (K, 3).
     """

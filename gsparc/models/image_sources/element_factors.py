@@ -31,7 +31,7 @@ def direct_path(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
 
 
 def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
-    """What channels of each antenna must be multiplied by, (E,) complex64, the first by 1; None: nothing.
+    """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
 
     Args:
         rows: of a static array of E antennas, one output; those without a row are multiplied by 1.

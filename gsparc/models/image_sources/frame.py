@@ -121,7 +121,7 @@ class SourcesInFrame(ClosedForm):
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """The paths that `predict` sums, one per source: of several searches, with the search's weight.
+        """Return the paths that `predict` sums, one per source: of several searches by the search's weight.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit

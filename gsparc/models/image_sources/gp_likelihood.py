@@ -63,7 +63,7 @@ class CircularGains:
         return Conditioned.of(self.matrix, self.target)
 
     def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
-        """Derivatives (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
+        """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
         for k, one in enumerate(correlation):
@@ -218,7 +218,7 @@ class Posterior:
 
 
 def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
-    """The scene with the phases of each source's mean gain under the circular process, and a noise floor."""
+    """Return the scene with phases of mean gains under the circular process, and a noise floor."""
     posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
     # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)

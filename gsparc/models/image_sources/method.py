@@ -299,7 +299,7 @@ class ImageSourceGP(SourcesInFrame):
         return ("searches", "keep", "confidence")
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
+        """Return `contribution0`, `contribution1`, ... (K,): mean power of each search's sources at rows."""
         return {
             f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
             for i, member in enumerate(self.members)

@@ -69,7 +69,7 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
 
 
 def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
-    """Places (S, E, 3) [m] of the antennas at positions (S, 3); E = 1 when the array's geometry is unknown.
+    """Return places (S, E, 3) [m] of antennas at positions (S, 3); E = 1 where the geometry is unknown.
 
     Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
     """
@@ -79,7 +79,7 @@ def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> T
 
 
 def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor) -> Tensor:
-    """Where each antenna's channel is measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m].
+    """Return where antennas' channels are measured (`Rows.places`): (S, E, 3) or (S, E, 6) float64 [m].
 
     Args:
         site: where.

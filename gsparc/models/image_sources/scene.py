@@ -124,7 +124,7 @@ class Scene:
         return torch.polar(torch.ones(()), self.phase)
 
     def visible_share(self, places: Tensor) -> Tensor:
-        """Share of each source that clutter lets through to places (n, 3) [m]: (n, K), or (1, 1)."""
+        """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3) [m]."""
         if not len(self.clutter):
             return torch.ones(1, 1)
         return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
@@ -145,7 +145,7 @@ class Scene:
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
     def unobstructed(self, rows: Rows) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, turned by their phases, without clutter."""
+        """Return waves (n, K) complex64 of sources at every row, turned by phases, without clutter."""
         waves = steering(rows, self.images(rows))
         return waves if self.phase is None else waves * self.turns
 
@@ -155,7 +155,7 @@ class Scene:
         return waves if self.phase is None else waves * self.turns
 
     def longer(self, order: int) -> list[Reflections]:
-        """Other sequences over the planes: those of up to `order` with one more at the end, and all pairs."""
+        """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
         indices = range(len(self.planes))
         more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
         known = set(self.sequences)

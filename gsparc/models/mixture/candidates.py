@@ -43,7 +43,7 @@ def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext
 
 
 def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Coherent waves, or what the path loses in walls of a file (`init=scene`), and a process of the rest.
+    """Make coherent waves, or losses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
         DataError: `init=scene` without a file, or walls that cannot be.

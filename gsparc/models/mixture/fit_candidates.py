@@ -205,7 +205,7 @@ def _held(
 def weigh_process(
     field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
 ) -> tuple[tuple[GaussianProcess, float] | None, float | None]:
-    """What a plain process on whole targets is worth next to a field, on rows that neither learned from.
+    """Return what a plain process on whole targets is worth beside a field, by rows neither learned from.
 
     Those are validation rows and, of spectra, training rows that both predict without their neighbours:
     a dozen rows alone decide by chance.

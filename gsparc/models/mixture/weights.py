@@ -29,7 +29,7 @@ LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
 def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[float, ...]:
-    """Weights in [0, 1] of sum one: of one alone, unless a mixture is surely better; see `choose_weights`.
+    """Return weights in [0, 1] of sum one: one alone, unless a mixture is surely better.
 
     Args:
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
@@ -55,13 +55,13 @@ class Rows:
     target: np.ndarray
 
     def log_errors(self, weight: float) -> np.ndarray:
-        """Logarithm (n,) of the mean squared error of each row, the second weighed by `weight`."""
+        """Return the log (n,) of each row's mean squared error, the second weighed by `weight`."""
         mixed = (1 - weight) * self.own + weight * self.plain
         return np.log(((mixed - self.target) ** 2).mean(1) + LEAST_ERROR)
 
 
 def share_of_second(parts: Sequence[Rows]) -> float:
-    """Weight in [0, 1] of the second of two predictors with which the mean PSNR over all rows is largest.
+    """Return the weight in [0, 1] of the second of two predictors that makes the mean PSNR of rows largest.
 
     0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
     second alone is better than the first: a query may take longer rather than lose to it. Few rows that
@@ -85,7 +85,7 @@ def error(predicted: Tensor, target: Tensor) -> float:
 
 
 def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
-    """Share of the variance that a prediction explains, of complex targets about zero; at most 1."""
+    """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
     middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
     whole = (target - middle).abs().square().sum().clamp_min(1e-30)
     return 1 - float((predicted - target).abs().square().sum() / whole)
@@ -137,7 +137,7 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
 
 
 def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Weights (K,) of the predictions: one alone, unless a mixture is better by more than a standard error.
+    """Return weights (K,) of predictions: one alone, unless a mixture is better by over a standard error.
 
     The mixture is judged on units whose rows its weights were not learned from.
 

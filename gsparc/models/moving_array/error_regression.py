@@ -29,7 +29,7 @@ RIDGES = np.logspace(-2, 4, 13)  # chosen by leave-one-out
 
 
 def image_features(image: Tensor, added: Tensor) -> Tensor:
-    """Features (n, 3) of predicted images: logarithms of brightness and of what is added, largest pixel.
+    """Return features (n, 3) of predicted images: log brightness, log of what is added, largest pixel.
 
     Args:
         image: (n, H, W), the prediction.
@@ -89,7 +89,7 @@ class ErrorRegression(WithKernel):
         return 1 - known / (1 + error), variance
 
     def relative_error(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m] to the nearest; see `expected`.
+        """Return the expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m]; see `expected`.
 
         Beyond the largest distance between training places it grows with the distance squared.
         """

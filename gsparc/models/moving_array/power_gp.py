@@ -64,12 +64,12 @@ class Trend(WithKernel):
     weights: Tensor
 
     def powers(self, far: Tensor) -> Tensor:
-        """Power (m, K) of every source at places that are `far` (m, n) [m] from the training receivers."""
+        """Return powers (m, K) of sources at places that are `far` (m, n) [m] from training receivers."""
         return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
 
 
 def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and their left-out residuals (n, K)."""
+    """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
     posterior = Exact.of(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, left_out(posterior.factor.precision, posterior.weights)[0]
 

@@ -110,7 +110,7 @@ class Images:
 
 
 def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The mean of the first `searches` with the strongest components of the residual (`keep`, a share).
+    """Return the mean of the first `searches` with the strongest components of the residual (`keep`).
 
     On fewer pixels (`stride`) and without its variance.
 

@@ -68,7 +68,7 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
 
 
 def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
-    """Leave-one-out square error of images (n, R) under the kernel of largest likelihood, and that kernel."""
+    """Return the left-out squared error of images (n, R) under the likeliest kernel, and that kernel."""
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
     scores = centred @ principal(centred, KERNEL_COMPONENTS)[1].T
@@ -79,7 +79,7 @@ def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
 
 
 def principal(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """The at most `limit` principal axes (C, R) of values (n, R), and the energy (C,) along each, falling."""
+    """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them, falling."""
     n, r = values.shape
     gram = values @ values.T if n <= r else values.T @ values
     keep = min(limit, n, r)

@@ -68,7 +68,7 @@ class GaussianNetwork(Network):
 
 
 def gaussians_of(scene: Scene, count: int) -> GaussianField:
-    """All around a static receiver between 1 and 6 m; for a moving one uniform in its box and 2 m around."""
+    """Draw all around a static receiver between 1 and 6 m; of a moving one in its box and 2 m around."""
     static = scene.receiver
     place, turn = (None, None) if static is None else (static.position, static.rotation)
     init: Literal["uniform", "sphere"] = "uniform" if static is None else "sphere"
@@ -77,7 +77,7 @@ def gaussians_of(scene: Scene, count: int) -> GaussianField:
 
 
 def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
-    """Grid and cut-off: spectra bring their grid; channels see the full sphere, with relative cut-offs."""
+    """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(1e-3, relative=True)}
 

@@ -101,7 +101,7 @@ class DirectedRays(Network):
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
     def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
-        """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).
+        """Return virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and which are (B, P).
 
         At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
         they were measured to see.
@@ -113,7 +113,7 @@ class DirectedRays(Network):
         return self.precomputed["virtual"][best.indices], best.values >= 0.5
 
     def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
-        """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""
+        """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m], those likely (B, P)."""
         towards = goals - places[:, None]
         apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
         heading = towards / apart

@@ -85,7 +85,7 @@ class PlanarGaussians(GaussianNetwork):
         return self.strengths + self._changes(tx, rx)[-1][0, :, 0]
 
     def cloud(self, strengths: Tensor) -> GaussianCloud:
-        """A metre from the receiver, before they are moved; opacities are strengths, as nothing is occluded.
+        """Return them a metre from the receiver, not yet moved; opacities are strengths: nothing is hidden.
 
         Raises:
             ValueError: the receiver moves: they are directions, and lie nowhere.
@@ -121,7 +121,7 @@ class SwiftWRF(DeformedPeer):
 
 
 def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
-    """`count` even directions (N, 3) over the grid's part of the sphere, and their tangents (N, 2, 3)."""
+    """Return `count` even directions (N, 3) over the grid's part of a sphere, and tangents (N, 2, 3)."""
     low = grid.first_elevation - grid.elevation_step / 2
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
     step = torch.arange(count) + 0.5

@@ -194,7 +194,7 @@ class TrainedPeer(Method):
         return self.network
 
     def size(self) -> int:
-        """Number of Gaussians or virtual transmitters; 0 for a network without, and before `fit`."""
+        """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""
         return 0 if self.network is None else self.network.count
 
     def gradient_problem(self) -> str | None:

@@ -50,7 +50,7 @@ def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
 
 
 def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
-    """What `one` gains, by squared errors (n,) [dB^2] of both at rows left out, and the rows' groups (n,)."""
+    """Return what `one` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
     gain = other - one
     total = np.bincount(group, gain - gain.mean())
     return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))

@@ -37,7 +37,7 @@ class Choices:
 
 
 def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
-    """Choices for a site, and one line for each that was `auto`: "init=auto -> uniform: the receiver moves".
+    """Return choices for a site, and lines on those left `auto`: "init=auto -> uniform: the receiver moves".
 
     A closed-form start needs spectra, a static receiver, a linear read-out and kernel features. Hidden units
     need an encoding of few values, because each Gaussian has a network of its own.

@@ -49,7 +49,7 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
 
 @torch.no_grad()
 def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """`contribution` (N,): what each Gaussian adds to the predictions at training rows (n,), on average.
+    """Return `contribution` (N,): what each Gaussian adds to predictions at training rows (n,) on average.
 
     Its weight summed over the directions of the receiver times the size of its emission. `receiver` (4, 3) is
     the pose of a static one, its position [m] above its rotation.

@@ -27,7 +27,7 @@ def evolve(
     generator: torch.Generator,
     rounds: int = 14,
 ) -> tuple[Tensor, float]:
-    """The best descendant (d,) of parents (m, d), and its score, by a (mu, lambda) evolution strategy."""
+    """Return the best descendant (d,) of parents (m, d) of a (mu, lambda) strategy, and its score."""
     best, spread = score(parents), SPREAD
     for number in range(rounds):
         born = parents.repeat_interleave(CHILDREN, 0)

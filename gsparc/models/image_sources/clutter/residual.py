@@ -155,7 +155,7 @@ class CandidateScorer:
         return self.score_positive(change)[0]
 
     def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
-        """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
+        """Return nats (m,) of adding waves (n, K), times each `share` (b, K, n) under b of m candidates."""
         scores = []
         for part in candidates.split(BLOCK):
             raise_if_cancelled()

@@ -129,7 +129,7 @@ class Mirrors:
         return ((), *(sequences[i] for i in best[: most - 1].tolist()))
 
     def hiding(self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor) -> Clutter:
-        """The rectangles that sequences are mirrored in or that hide one from a place, and the boxes."""
+        """Return the rectangles that mirror sequences or that hide one from a place, and the boxes."""
         clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
         used = {index for sequence in sequences for index in sequence}
         numbers = []
@@ -210,7 +210,7 @@ def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def affordable(mirrors: int, length: int) -> int:
-    """How many mirrors, at most `mirrors`, have at most `MOST_SEQUENCES` sequences of so many reflections."""
+    """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
         count -= 1

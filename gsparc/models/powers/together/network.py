@@ -48,7 +48,7 @@ STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
 def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
-    """The sectors that stations are; None where neither beams are known, nor lists of sites with several.
+    """Return the sectors that stations are; None without known beams or lists of sites with several.
 
     Args:
         data: powers of several stations.
