@@ -105,5 +105,5 @@ class StopAt(L.Callback):
         self.step = step
 
     def on_train_batch_end(self, trainer: L.Trainer, module: GaussianModule, *unused: Any) -> None:  # type: ignore[override]
-        """After every step."""
+        """End training after the last step, when it was taken."""
         trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step

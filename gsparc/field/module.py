@@ -104,7 +104,7 @@ class NetworkModule(L.LightningModule):
         return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """The rates of the step that was taken, under the names of their settings (`OptimizerSettings`)."""
+        """Log rates of the step that was taken, by names of their settings (`OptimizerSettings`)."""
         if self.global_step % self.log_every == 0:
             groups = self.trainer.optimizers[0].param_groups
             self.log_dict({f"rate/{group['kind']}": group["lr"] for group in groups})
@@ -153,7 +153,7 @@ class NetworkModule(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
-        """A checkpoint of ours holds a whole model: `NotImplementedError` says what reads it."""
+        """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
         raise NotImplementedError(
             "a checkpoint holds a whole model: say gsparc.models.loading.module_of(FILE)"
         )
@@ -165,7 +165,7 @@ class NetworkModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A poisoned state never replaces a good checkpoint."""
+        """Refuse a poisoned state, which must never replace a good checkpoint."""
         if self._offender() is not None and self.batch is not None:
             raise self._stop(self.batch, int(self.batch.index[0]))
 

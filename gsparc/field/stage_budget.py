@@ -40,7 +40,7 @@ class Budget(L.Callback):
             self.budget.moved()
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """What making the Trainer took is no part of the stage; look at the clock."""
+        """Leave out what making the Trainer took, which is no part of the stage; look at the clock."""
         self._begin = self._begin + (self._learned - self._resumed)
         self._look(trainer)
 

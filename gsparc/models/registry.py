@@ -22,14 +22,14 @@ if TYPE_CHECKING:  # brings torch, which a list of choices does not need
 
 @cache
 def methods() -> dict[str, str]:
-    """Import paths of the methods of `conf/model`, by name."""
+    """Return import paths of the methods of `conf/model`, by name."""
     files = (file for file in resources.files("gsparc.conf").joinpath("model").iterdir() if file.is_file())
     nodes = {file.name: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
     return {name.removesuffix(".yaml"): nodes[name]["_target_"] for name in sorted(nodes)}
 
 
 def known() -> dict[str, str]:
-    """Import paths of all methods by name: `methods()` and what plugins bring."""
+    """Return import paths of all methods by name: `methods()` and what plugins bring."""
     return plugins("model") | methods()
 
 

@@ -136,7 +136,7 @@ class Group(At):
 
 
 def refuse(site: Site) -> None:
-    """`ValueError` for data that waves of a known length cannot explain."""
+    """Raise a `ValueError` for data that waves of a known length cannot explain."""
     if site.kind != "csi" or site.wavelength is None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 

@@ -61,7 +61,7 @@ class Probe:
         return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
     def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
-        """Rise of the log likelihood (m,) [nats] with each of waves (m, n) complex128 alone, of some power.
+        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
 
         `known` (m,) stands in for `known(waves)`.
         """

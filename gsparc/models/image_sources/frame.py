@@ -144,7 +144,7 @@ class SourcesInFrame(ClosedForm):
 
 
 def refuse(site: Site, name: str) -> None:
-    """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
+    """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
@@ -152,7 +152,7 @@ def refuse(site: Site, name: str) -> None:
 
 
 def refuse_turning(data: Measurements) -> None:
-    """`ValueError` where a static receiver of several antennas turns between measurements."""
+    """Raise a `ValueError` where a static receiver of several antennas turns between measurements."""
     antennas = data.target.shape[1]
     if static_array(data.site, antennas) is None:
         return

@@ -178,7 +178,7 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Powers, trends, residual and errors anew, with the sources and kernels of the fit."""
+        """Solve powers, trends, residual and errors anew, with the sources and kernels of the fit."""
         self.rows = rows = heard(data, rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")

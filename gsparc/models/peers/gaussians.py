@@ -129,6 +129,6 @@ class Deformation(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, places: Tensor, queries: Tensor) -> Tensor:
-        """places (N, 3) [m], queries (B, 3) [m] -> (B, N, outputs)."""
+        """Return changes (B, N, outputs) of places (N, 3) [m] by queries (B, 3) [m]."""
         hidden = self.by_place(self.place(places)) + self.by_query(self.query(queries)).unsqueeze(1)
         return self.rest(torch.relu(hidden))

@@ -98,14 +98,14 @@ class ComplexGaussians(GaussianNetwork):
         return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:
-        """Further training drops the frozen view."""
+        """Drop the frozen view, which further training makes stale."""
         self._frozen = None
         super().train(mode)
         return self
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
-        """A static receiver's view is frozen once."""
+        """Render spectra or channels; a static receiver's view is frozen once."""
         if self.response is not None or rx.batched or self.training:
             return self(tx, rx)
         if self._frozen is None:

@@ -58,7 +58,7 @@ class MarchedField(Network):
         self.register_buffer("directions", scene.site.grid.directions(torch.float32).reshape(-1, 3))
 
     def march(self, origin: Tensor, heading: Tensor, query: Tensor) -> Tensor:
-        """Magnitude (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
+        """Return magnitudes (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
         step = self.far / self.samples
         depth = step * torch.arange(self.samples)
         places = origin[:, None] + depth[:, None] * heading[:, None]

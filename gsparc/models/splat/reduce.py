@@ -167,7 +167,7 @@ def _linear(model: GaussianModel) -> bool:
 
 @torch.no_grad()
 def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
-    """The emissions with which `few` come nearest to the images of the whole field, at all positions at once.
+    """Set emissions of `few` that come nearest to images of the whole field, at all positions at once.
 
     Images are W E f(x) with weights W (pixels x Gaussians), read-outs E and features f: least squares over
     the pixels gives E of the few from W E of all.

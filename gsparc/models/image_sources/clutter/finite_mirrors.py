@@ -40,7 +40,7 @@ MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
 def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
-    """Return the patch (4,) on a plane that explains most if its sequences are seen only in it, and its nats."""
+    """Return the patch (4,) on a plane that explains most if sequences end on it alone, and its nats."""
     mine = [k for k, sequence in enumerate(left.scene.sequences) if number in sequence]
     few, waves = left.paths.take(mine), left.waves[:, mine]
     along = tangents(left.scene.planes[number])

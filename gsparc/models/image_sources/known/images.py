@@ -50,7 +50,7 @@ class Mirrors:
 
     @staticmethod
     def of(walls: SceneWalls, origin: np.ndarray) -> Mirrors:
-        """Faces of one plane are joined; those that touch each other make one rectangle around them.
+        """Join faces of one plane; those that touch each other make one rectangle around them.
 
         Args:
             walls: of a file.
