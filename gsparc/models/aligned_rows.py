@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 NEIGHBOURS = 50  # rows that tell of a row
 AT_ONCE = 4_096  # rows whose weights are solved together: memory
 TREE = 2_000  # rows of the spanning tree; others hang on the nearest of these
-ROUNDS, SWEEPS = 6, 10
+ROUNDS, SWEEPS = 6, 10  # of settings and factors in turn; of all factors in a round
 WAVE_SWEEPS = 40
 WAVE_NOISE = 0.1  # of the signal's power
 ANTENNAS = 4  # with one factor, from which on only phases of waves fit all
@@ -79,6 +79,7 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
+            # Where gains are free rows have no level of their own: all are learned at unit power.
             level = np.maximum(_rms(rows.values), 1e-30)[rows.moment]
             factors = factors / level[:, None, None]
             if noise is not None:
@@ -130,7 +131,7 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Of what was measured in rows (n, A, K), (n,)."""
+    """Root mean square (n,) of what was measured in rows (n, A, K)."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
     return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
 
@@ -140,8 +141,9 @@ _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measuremen
 
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
-    """The better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
+    # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
         values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
@@ -169,6 +171,7 @@ class _Rows:
         values = self.values if direct is None else self.values * direct.conj()
         factors = np.ones((len(values), len(self.tones)), np.complex128)
         trunk = covering(self.places, TREE, 0)
+        # A distance of 0 would be no edge, and several rows may lie at one place.
         tree = minimum_spanning_tree(cdist(self.places[trunk], self.places[trunk]) + 1e-12)
         order, before = breadth_first_order(tree, 0, directed=False)
         child, parent = trunk[order[1:]], trunk[before[order[1:]]]
@@ -187,7 +190,7 @@ class _Rows:
         return "phase" if self.freedom == "phase" else "phase+delay"
 
     def smooth(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by a process of two lengths; of its rounds the one that tells rows best."""
+        """Go on from these factors by a process of two lengths; return the round that tells rows best."""
         kernel, found = first_kernel(self.length, spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
@@ -197,7 +200,8 @@ class _Rows:
         return min(found, key=lambda each: each.error)
 
     def waves(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by waves from everywhere alike."""
+        """Go on from these factors by waves from everywhere alike."""
+        # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
         weights = self._weights(Kernel((waves,), WAVE_NOISE))
         factors = self._swept(factors, weights, WAVE_SWEEPS)

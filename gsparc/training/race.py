@@ -41,7 +41,7 @@ class Race:
         cls, rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None],
         effort: float = 1.0,
     ) -> Race:  # fmt: skip
-        """A candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
+        """Return a candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
         squared, energy = (rowwise(one) for one in (mean - target, target))
         return cls(rows, squared, energy, note, effort)
 
@@ -51,7 +51,7 @@ class Race:
         return float(self.squared.sum() / max(self.energy.sum(), 1e-30))
 
     def looked(self, what: str, rows: np.ndarray, squared: np.ndarray, before: float = 0.0) -> float:
-        """The error of another candidate where both left rows out, as a share of their energy.
+        """Return the error of another candidate where both left rows out, as a share of their energy.
 
         Args:
             what: it is, for the learning curve.
