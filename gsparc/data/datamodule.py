@@ -89,6 +89,7 @@ class StepLoader:
         for step in range(start, (start // len(self) + 1) * len(self)):
             rows = order(self.seed, step, self.batch_size, self.pool)
             mine = share(rows, self.rank, self.devices)
+            # A device without a row of its own repeats one, so that it joins the step, with weight 0.
             part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
             yield replace(self.data.batch(mine), share=part)
 
@@ -190,6 +191,7 @@ class DataModule(pl.LightningDataModule, ABC):
         return self.fold
 
     def _batches_shown(self) -> int:
+        # Without a trainer, as in a notebook, batches begin with the first one.
         if self.trainer is None:
             return 0
         # `completed` is what a checkpoint restores; `ready` would count the batch a kill interrupted.
@@ -206,6 +208,7 @@ class Loaded(DataModule):
 
     def __init__(self, measurements: Measurements, batch_size: int = 16) -> None:
         super().__init__(measurements.site.name, batch_size)
+        # Takes the place of the cached property: nothing is read.
         self.measurements = measurements
 
     def load(self) -> Measurements:

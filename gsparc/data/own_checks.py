@@ -15,6 +15,7 @@ from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
 
+# From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
 
 
@@ -54,6 +55,7 @@ class Checker:
                 if unit != FIELDS[name].unit:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 continue
+            # Names that are there themselves are not what a misspelt one was to be.
             close = [n for n in difflib.get_close_matches(name, FIELDS, n=3) if n not in self.raw.arrays]
             if close:
                 self.refuse(name, f"unknown name; did you mean {close[0]}?")
@@ -87,6 +89,7 @@ class Checker:
         array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
         if array is None:
             return None
+        # Images of uint16 hold no stated largest value; of uint8 it is 255.
         wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
         if array.dtype.kind not in kinds or wide:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
@@ -104,6 +107,7 @@ class Checker:
                 want is None or want == size for want, size in zip(shape, array.shape, strict=True)
             ):
                 return True
+        # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
         turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
@@ -123,11 +127,13 @@ class Checker:
         rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
         names = rows_named if array.ndim == 2 else ["its value"]
         known = np.atleast_2d(array)
+        # Places that nobody gave are NaN on purpose and pass unchecked.
         if name == self.unknown:
             return array
         if check_positions(self.problems, self.where(name), known, names):
             return None
         stored = self.raw.arrays[name]
+        # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
         step = float(np.spacing(np.abs(stored).max())) if stored.dtype.kind == "f" else 0.0
         if stored.dtype.itemsize <= 4 and step > 1e-3:
             self.notes.append(
@@ -144,6 +150,7 @@ class Checker:
         if not np.isin(array, (0, 1)).all():
             return self.refuse("mask", f"expected True and False, found {array.dtype} of other values")
         mask = array.astype(bool)
+        # A row without a measured entry has no error to learn from and no power to scale by.
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
         if censored is not None:
             empty &= censored == 0
@@ -173,6 +180,7 @@ class Checker:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
         if frequency is None:
             return None, None if carrier is None else float(carrier)
+        # A single frequency with several columns: they may be antennas, and then the shape is wrong.
         if frequency.ndim == 0 and count not in (None, 1):
             self.refuse(
                 "frequency_hz",
@@ -185,6 +193,7 @@ class Checker:
     def rotation(self, rows: int) -> np.ndarray | None:
         """(S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.given("rx_orientation", "rx_rotation")
+        # Two statements of one rotation can disagree, and nothing says which is right.
         if len(present) == 2:
             fault = "rx_orientation and rx_rotation are both given; expected one of them"
             return self.problems.add(self.source, fault)
@@ -216,6 +225,7 @@ class Checker:
         last = elevation + (height - 1) * elevation_step
         if not np.isfinite(values).all() or elevation_step <= 0 or azimuth_step <= 0:
             return self.refuse("grid_deg", "expected four finite numbers, the two steps positive")
+        # Rounded steps of whole hemispheres end at 90 degrees but for some digits.
         if elevation < -90 - 1e-6 or last > 90 + 1e-6:
             fault = f"elevations run from {elevation:g} to {last:g}; expected -90 to 90"
             return self.refuse("grid_deg", fault)
@@ -232,6 +242,7 @@ class Checker:
         offsets = self.array("path_offsets", (rows + 1,))
         if offsets is None:
             return None
+        # Cast first: differences of unsigned integers wrap around and never are negative.
         if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
             return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
         for name in per_path:
@@ -287,6 +298,7 @@ def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.nd
     if not is_unit(q).all():
         order = "w, x, y, z" if scalar_first else "x, y, z, w"
         raise ValueError(f"expected a quaternion ({order}) of length 1, got length {_length(q)!s}")
+    # SciPy expects the scalar last and normalises, which removes the rounding of printed digits.
     if scalar_first:
         q = np.roll(q, -1, axis=-1)
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
@@ -294,6 +306,7 @@ def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.nd
 
 def is_rotation(matrix: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
     """Whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
+    # Products of huge or missing numbers are refused below, so that NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     good = np.isfinite(matrix).all(axis=(-1, -2)) & (error <= tolerance)

@@ -27,6 +27,7 @@ FEWEST = 2  # rows of a dataset
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample, station or path, and how many axes they then have.
 ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
+# Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
 ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
@@ -89,6 +90,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
+    # Steps of levels come first: they divide stations, whose parts are then kept or left out together.
     raw, notes = split_stations(raw, selection.level_steps or {}, source), list[str]()
     steps: tuple[Callable[..., Noted], ...] = (keep_stations, keep_runs, keep_above, keep_rows)
     for keep, value in zip(steps, vars(selection).values(), strict=False):  # the last are level steps
@@ -151,6 +153,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         raise DataError(f"{option}: {source} holds {name}; expected powers, rssi or rssi_db")
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
+        # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
     mask = raw.arrays.get("mask")
     if mask is not None and mask.shape != low.shape:
@@ -158,6 +161,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     low &= True if mask is None else mask.astype(bool)
     if low.ndim == 1:
         return _select(raw, ~low, option, source)
+    # A wide file cannot leave out single links: they are marked as not measured.
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
@@ -193,6 +197,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
         if _per_row(name, array, stations) and array.ndim and len(array) == count:
             part[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
+            # Rows may repeat or be gone: a row of the split then stands in several places, or in none.
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
@@ -200,6 +205,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
     offsets = arrays.get("path_offsets")
     if offsets is not None and offsets.shape == (count + 1,) and offsets.dtype.kind in "iu":
         offsets = offsets.astype(np.int64)
+        # Offsets that decrease are refused by whoever reads paths; until then such rows have none.
         lengths = np.diff(offsets).clip(0)[rows]
         part["path_offsets"] = np.concatenate([[0], np.cumsum(lengths)])
         for name in PATH_AXES:
@@ -306,6 +312,7 @@ def per_station(name: str, array: np.ndarray, count: int) -> bool:
 
 def _per_row(name: str, array: np.ndarray, stations: int | None) -> bool:
     """Whether an array has a row per sample, by its name, its axes and how many stations there are."""
+    # Frequencies may be of stations or of rows: where the counts agree they are of stations.
     if name == "carrier_hz" and array.ndim and len(array) == stations:
         return False
     return name in ALWAYS or array.ndim in ROW_AXES.get(name, ())
@@ -348,6 +355,7 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
         DataError: no such station or row, or the file has no stations.
     """
     for station, firsts in steps.items():
+        # Ascending, so that each step divides the part after the one before.
         for first in sorted(firsts):
             raw = _split(raw, station, first, source)
     return raw
@@ -371,5 +379,6 @@ def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
     if "station" in arrays:
         arrays["station"] = np.where((arrays["station"] == last) & after, count, arrays["station"])
     else:
+        # Before its step the new station was silent, and after it the old one.
         arrays["mask"][~after, count] = arrays["mask"][after, last] = False
     return replace(raw, arrays=arrays)

@@ -143,6 +143,7 @@ def suspicious_values(data: Measurements) -> list[str]:
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
         places, zones = ends[np.isfinite(ends).all(axis=1)], data.provenance.get("zones", "")
+        # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         hints = _units(places, zones) or _units(data.moving[:, :3] + site.origin, zones)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
@@ -151,6 +152,7 @@ def suspicious_values(data: Measurements) -> list[str]:
             hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
+        # Steps in radians taken for degrees: the columns then span 2 pi degrees.
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target == 0).any():
@@ -161,6 +163,7 @@ def suspicious_values(data: Measurements) -> list[str]:
         )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
+        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.
         if 0 < spread < 0.1:
             hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
     return hints
@@ -172,6 +175,7 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
     height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
     reach = np.abs(positions[:, :2]).max(axis=0)
     on_earth = reach.max() <= 180 and reach.min() <= 90
+    # Metres about a local origin lie near it; degrees of a small site lie many of its widths away.
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
         how = "then give them as latitude and longitude"
@@ -181,12 +185,14 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         by = f", as column {zones!r} says" if zones else ""
         said = f"two groups of places {groups[1] / 1e3:.4g} km apart{by}"
         return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
+    # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
         far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
         return [f"{far}; {hint}"]
+    # Survey tools print millimetres as whole numbers; metres come with decimals.
     if across > 1000 and (positions % 1 == 0).all():
         size = " x ".join(f"{e / 1000:.4g}" for e in extent)
         said = f"positions are whole numbers up to {across:.0f} apart"
@@ -223,6 +229,7 @@ def side_of_squares(data: Measurements) -> float | None:
     apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
     least = max(extent / 10, APART * apart)
     decade = 10 ** np.floor(np.log10(least))
+    # At 0.99 a least side of 2.01 m still may be 2 m.
     side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)
     return side if side < extent / 2 else None
 

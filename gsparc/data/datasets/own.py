@@ -101,6 +101,7 @@ class Own(Campaign):
     """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
 
     choice, reader = "own", staticmethod(raw_of_own)
+    # Arguments of `understood` but its data and its conventions, which are listed by name.
     switches = tuple(inspect.signature(understood).parameters)[1:-1] + tuple(CONVENTIONS)
 
 
@@ -110,6 +111,7 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind i
 
 def campaign_of(raw: Raw) -> str | None:
     """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
+    # By its arrays rather than its name: files are renamed, arrays are not.
     return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
@@ -139,6 +141,7 @@ def read_any(
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
+    # Releases before anything else: their folders may hold tables that look like one's own.
     release = release_of(path)
     if release is not None:
         reading = interpret(LOADERS[release](path), path)
@@ -169,6 +172,7 @@ def raw_of(
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
+    # Columns of tables are matched by their heads; arrays of several files may differ in every shape.
     if isinstance(path, Several) and not (cell_m is None and all(is_table(one) for one in path.paths)):
         raise DataError(f"{path}: several files are read as one where all are tables, without dataset.cell_m")
     if cell_m is None and not is_table(path):

@@ -76,6 +76,7 @@ class PublicSet:
         placed, top = {}, self.folder.resolve()
         for source in self.sources:
             path = self.folder / source.path.removeprefix(f"{self.strip}/")
+            # On Windows a backslash parts folders as well, and could lead out of this one.
             if not path.resolve().is_relative_to(top) or "\\" in source.path:
                 raise DataError(f"{self.name}: {source.path} would leave {self.folder}; nothing is fetched")
             placed[path] = source
@@ -83,6 +84,7 @@ class PublicSet:
 
     def missing(self) -> list[Path]:
         """Files that are not there in full size."""
+        # By size alone: hashes are checked when files are fetched, and reading all at each start takes long.
         return [p for p, one in self.files().items() if not p.is_file() or p.stat().st_size != one.bytes]
 
 
@@ -96,6 +98,7 @@ def public_sets() -> dict[str, PublicSet]:
     about = yaml.safe_load(files("gsparc.data.public").joinpath("sets.yaml").read_text(encoding="utf-8"))
     sets = {}
     for name, facts in about.items():
+        # Several sets may share the files of one release (`of`), each with its own part (`match`).
         pinned, match = sources.get(facts.pop("of", name), ()), facts.pop("match", "*")
         chosen = tuple(source for source in pinned if fnmatchcase(source.path, match))
         sets[name] = PublicSet(name, by_hand=facts.pop("from", None), **facts, sources=chosen)
