@@ -48,6 +48,7 @@ def check(
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
     warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
+    # Channels and spectra have conventions to be tried, powers of links have levels to be plausible.
     warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
@@ -63,6 +64,7 @@ def check(
             return False
         _line(console, f"{'drawn':<12}{draw}")
     try:
+        # The random split needs the fewest rows: where it cannot be drawn, no other one can.
         split_for({"name": "random"}, reading.data).check()
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")

@@ -30,6 +30,7 @@ class Command:
     def arguments(self, words: Sequence[str]) -> list[str]:
         """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
         paths = [word for word in words if self.bare and "=" not in word and not word.startswith("-")]
+        # Quoted in Hydra's grammar, as paths may hold spaces, commas and brackets.
         quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
         return [
             *(word for word in words if word not in paths),
@@ -86,5 +87,6 @@ def listed() -> str:
 
 def nearest(name: str) -> str:
     """`; did you mean 'train'?`, or what there is."""
+    # Below difflib's 0.6, as names of commands are short: one letter is a large share.
     close = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(COMMANDS)}"

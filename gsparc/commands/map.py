@@ -54,6 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
+    # Refused before evidence is gathered, which takes minutes.
     geotiff_wanted(config.geotiff, predictor.site.georeference)
     promise = promise_of(str(config.ckpt), settings)
     field = map_of(predictor, promise=promise, **query)
@@ -78,6 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     if coverage is not None and promise is not None:
         reach = promise.calibration(how.share).reach
+        # NaN alone differs from itself: figures that these rows do not tell are left out.
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s)"

@@ -22,6 +22,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
+    # Powers alone have a lowest and a highest.
     ends = [value for name, value in facts.items() if name.startswith(("predict/lowest", "predict/highest"))]
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"

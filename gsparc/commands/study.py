@@ -61,6 +61,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
     try:
+        # Rounds that were done on other data, splits or settings do not count as these.
         state = State.of(config, content(data), split.sha256)
         rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training

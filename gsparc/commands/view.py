@@ -35,6 +35,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
     RunSettings.of(config)
     save = None if config.save is None else Path(str(config.save))
+    # Before model and data are read, which takes seconds.
     check(save, int(config.port))
     view = view_of(plain(config))
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
@@ -51,6 +52,7 @@ def check(save: Path | None, port: int) -> None:
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
     whole(0, 65535).check("port", port)
+    # Pages are made of viser's client; pictures and splat files are not.
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
         without = "(save=picture.png and save=gaussians.ply do without)"
         raise DataError(f"viewing in a browser needs viser: pip install 'gsparc[viewer]' {without}")
@@ -71,6 +73,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 
 def serve(view: SiteView, host: str, port: int) -> str:
     """Until Ctrl-C; returns what is said then."""
+    # Imported here, as viser is an extra that pictures do without.
     from gsparc.apps.view.server.serve import Server
 
     server = Server(view, host, port)

@@ -33,6 +33,7 @@ def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), befo
     console = open_console()
     for one in tables:
         console.print(one)
+    # Hydra opens a log for every job; one without a line is not worth a word.
     log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
     for line in (*warned_again(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
@@ -57,6 +58,7 @@ def columns(rows: Sequence[Any], of: type) -> dict[str, list[Any]]:
 
 def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
     """Columns of a table of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
+    # Tenths of a millimetre here, about a millimetre in 1e-8 degrees.
     columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
     if predictor is not None and predictor.site.georeference is not None and len(places):
         latitude, longitude, _ = predictor.degrees(places)
