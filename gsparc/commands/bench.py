@@ -28,7 +28,7 @@ ROWS = ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "ke
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Time all cases and promises; return the facts written to `summary.json` in the run directory."""
     if config.quick:
         config = config.copy()
         config.update(QUICK)
@@ -66,7 +66,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def rows_table(rows: Sequence[Row]) -> Table:
-    """Every row: time, limit, ratio."""
+    """Return a table of every row: time, limit, ratio."""
     sheet = table("", ["operation", "projection"], ROWS, [])
     sheet.caption = "ms, median; limit: see gsparc/prediction/bench/measure.py"
     for row in rows:
@@ -79,7 +79,7 @@ def rows_table(rows: Sequence[Row]) -> Table:
 
 
 def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
-    """Every promise and whether it holds here."""
+    """Return a table of every promise and whether it holds here."""
     sheet = table("Promises", ["promise", "where"], ["ratio", "promised", "met"], [])
     for where, claim in claims:
         bound = f"{'at least' if claim.at_least else 'at most'} {claim.bound:g}"
@@ -89,7 +89,7 @@ def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
 
 
 def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
-    """Tables as Markdown, under the machine, its load and the commit they were measured at."""
+    """Return tables as Markdown, under the machine, its load and the commit they were measured at."""
     load = f"load per core {facts['machine/load_before']:.2f} before and {facts['machine/load']:.2f} after"
     head = f"{facts['machine/cpu']}, {facts['machine/instruction_set']}, {facts['machine/cores']} cores"
     lines = [f"# {head}, {load}, commit {facts['git']}"]

@@ -60,7 +60,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def tables(facts: dict[str, Any]) -> list[Table]:
-    """Confidences side by side; bounds beside what came of them."""
+    """Return tables of confidences side by side, and of bounds beside what came of them."""
     wanted = {
         "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
         "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),

@@ -56,7 +56,7 @@ def evaluate_files(
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Test checkpoints; return the facts written to `summary.json` in the run directory."""
     RunSettings.of(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)

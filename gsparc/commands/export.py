@@ -24,7 +24,7 @@ from gsparc.prediction.placing import in_world, with_heights
 from gsparc.prediction.predictor import Predictor
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
-# The C library neither draws Gaussians nor runs on a GPU, and is not called from Python.
+# Sources of GPU kernels, of projections and of the Python module are no part of the C library.
 OTHERS = shutil.ignore_patterns("cuda", "projection", "bindings.cpp")
 LIMITS = {name: whole(1) for name in ("places", "taps", "antennas")}
 LIMITS |= {"rate_hz": or_null(POSITIVE), "to": choice("c", "taps", "deepmimo")}

@@ -32,7 +32,7 @@ BEAMS = {
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """All three experiments on one checkpoint; returns the facts of `summary.json`."""
+    """Run all three experiments on one checkpoint; return the facts of `summary.json`."""
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
@@ -66,7 +66,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
-    """Rates, block errors and beams; what was not computed has no table."""
+    """Return tables of rates, block errors and beams; what was not computed has no table."""
     kind = facts["confidence/kind"]
     accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
     rates = [

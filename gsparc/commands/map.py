@@ -21,12 +21,12 @@ from gsparc.prediction.timing import peak_memory
 
 
 def settings_of(config: DictConfig) -> RunSettings:
-    """The settings of a run, of which `stations` is not one here: it holds names."""
+    """Check the settings of a run, of which `stations` is not one here: it holds names."""
     return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
 
 
 def stations_of(setting: Any) -> list[str | int] | None:
-    """Names or numbers; None for `all`.
+    """Return names or numbers; None for `all`.
 
     Raises:
         DataError: neither.

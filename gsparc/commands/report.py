@@ -18,7 +18,7 @@ from gsparc.evaluation.summary import program, provenance, write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Write one page about runs; return the facts written to `summary.json` in the run directory."""
     if OmegaConf.is_missing(config, "runs"):
         raise ValueError("no run is named; say gsparc report RUN..., folders of runs or of whole sweeps")
     paths = [Path(path) for path in config.runs]

@@ -22,7 +22,7 @@ OTHERS = 64  # files that are open beside connections: the log, libraries
 
 
 def loopback(host: str) -> bool:
-    """Whether nobody else reaches it."""
+    """Tell whether a host is this machine itself, which nobody else reaches."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

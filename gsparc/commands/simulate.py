@@ -30,7 +30,7 @@ OTHERS = "ours: conference_room, shoebox; your own: osm (scene.file=TOWN.osm), x
 
 
 def campaign(config: DictConfig) -> Campaign:
-    """The campaign that a composed configuration describes.
+    """Return the campaign that a composed configuration describes.
 
     Raises:
         ValueError: a setting that does not exist or cannot be.

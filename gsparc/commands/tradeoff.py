@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts of `summary.json`; a job of a multirun is done once."""
+    """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     state = State.of(config, content(run.data), run.split.sha256)

@@ -331,7 +331,7 @@ def _draw(
 
 
 def objective_of(config: DictConfig, kind: Scored) -> str:
-    """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
+    """Return the figure of rows `eval_on` that a search improves; `objective: null`: the deciding one.
 
     Raises:
         ValueError: there is no such figure.

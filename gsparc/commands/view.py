@@ -59,7 +59,7 @@ def check(save: Path | None, port: int) -> None:
 
 
 def view_of(settings: dict[str, Any]) -> SiteView:
-    """Everything that is shown, from a configuration; `DataError` for a file or a place that cannot be."""
+    """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
     plan, walls = plan_of(settings), settings["walls"]
     building = Building(plan, None if walls is None else read_walls(walls))
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
@@ -72,7 +72,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 
 
 def serve(view: SiteView, host: str, port: int) -> str:
-    """Until Ctrl-C; returns what is said then."""
+    """Serve until Ctrl-C; return what is said then."""
     # Imported here, as viser is an extra that pictures do without.
     from gsparc.apps.view.server.serve import Server
 
@@ -83,7 +83,7 @@ def serve(view: SiteView, host: str, port: int) -> str:
 
 
 def write(view: SiteView, path: Path) -> str:
-    """A page, a picture or a splat file, whole or not at all; returns what is said then."""
+    """Write a page, a picture or a splat file, whole or not at all; return what is said then."""
     ending = path.suffix.lower()
     if ending == ".png":
         draw_still(view, path)
