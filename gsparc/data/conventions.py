@@ -44,19 +44,19 @@ class Signals:
 
     @classmethod
     def of(cls, data: Measurements) -> Self:
-        """Those of measurements that are no powers."""
+        """Take the signals of measurements that are no powers."""
         site, tones = data.site, None if data.site.kind == "spectrum" else data.site.tones()
         array = None if site.array is None or len(site.array) != data.target.shape[1] else site.array
         ends = data.tx, data.rx_position, data.rx_rotation
         return cls(data.target, data.mask, *ends, tones, None if tones is None else array, site.grid)
 
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Signals:
-        """The same with entries of values and mask elsewhere."""
+        """Return the same with entries of values and mask elsewhere."""
         mask = None if self.mask is None else change(self.mask)
         return replace(self, values=change(self.values), mask=mask)
 
     def rows(self, part: slice | np.ndarray) -> Signals:
-        """Some of the rows."""
+        """Return some of the rows."""
         of_rows = ("values", "mask", "tx", "rx", "rotation")
         whole = {name: getattr(self, name) for name in of_rows}
         parts: dict[str, Any] = {name: None if one is None else one[part] for name, one in whole.items()}
@@ -226,7 +226,7 @@ CONVENTIONS = {name: Convention(*row, name not in UNTRIED) for name, row in _ROW
 
 
 def mended(signals: Signals, names: Iterable[str]) -> Signals:
-    """Signals of the schema's conventions, from those of a file that follows the ones named.
+    """Return signals in the schema's conventions, from those of a file that follows the ones named.
 
     Raises:
         DataError: no such convention, or one that cannot be of these measurements.

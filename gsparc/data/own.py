@@ -59,7 +59,7 @@ def load_own(path: str | Path) -> Measurements:
 
 
 def interpreted(raw: Raw, source: str | Path) -> Measurements:
-    """The measurements of `interpret`; notes are logged."""
+    """Return the measurements of `interpret`; notes are logged."""
     reading = interpret(raw, source)
     for note in reading.notes:
         log.warning("%s: %s", source, note)
@@ -86,7 +86,7 @@ def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | 
 
 
 def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> Measurements:
-    """The same without a file.
+    """Validate arrays as `write_own` does, without a file.
 
     Raises:
         DataError: what `load_own` would refuse.

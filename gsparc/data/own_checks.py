@@ -30,7 +30,7 @@ class Checker:
         self.unknown: str | None = None  # a position that nobody gave
 
     def where(self, name: str) -> str:
-        """How messages name an array of this file."""
+        """Say how messages name an array of this file."""
         return f"{self.source}, {name}"
 
     def refuse(self, name: str, what: str) -> Any:
@@ -44,11 +44,11 @@ class Checker:
         return len(rows) > 0
 
     def given(self, *names: str) -> list[str]:
-        """Those of `names` that the file holds."""
+        """Return those of `names` that the file holds."""
         return [name for name in names if name in self.raw.arrays]
 
     def names(self) -> None:
-        """Misspelt names are refused, other unknown ones are noted as ignored; units must be the schema's."""
+        """Refuse misspelt names and foreign units; note that other unknown names are ignored."""
         for name in self.raw.arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
@@ -63,7 +63,7 @@ class Checker:
                 self.notes.append(f"{name}: not part of the schema, ignored")
 
     def measurement(self) -> str | None:
-        """Which of spectrum, csi, rssi, rssi_db to read: the only one, or the one that an attribute names."""
+        """Choose spectrum, csi, rssi or rssi_db: the only one, or the one that an attribute names."""
         present, named = self.given(*MEASUREMENTS), self.raw.attributes.get("measurement")
         if named is not None and named not in present:
             there = " and ".join(present) or "none of these"
@@ -77,7 +77,7 @@ class Checker:
         return self.problems.add(self.source, f"{wanted}; found {names}")
 
     def name_rows(self, rows: int) -> list[str]:
-        """What messages call each row: `row_name`, or its number."""
+        """Return what messages call each row: `row_name`, or its number."""
         names = self.raw.arrays.get("row_name")
         self.row_names = [f"row {i}" for i in range(rows)]
         if names is not None and self.fits("row_name", names, (rows,)):
@@ -85,7 +85,7 @@ class Checker:
         return self.row_names
 
     def array(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """Array `name` when it is of its kinds of dtypes and fits one of `shapes` (None: any length)."""
+        """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
         array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
         if array is None:
             return None
@@ -96,12 +96,12 @@ class Checker:
         return array if self.fits(name, array, *shapes) else None
 
     def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """The same as float64."""
+        """Return the same as float64."""
         array = self.array(name, *shapes)
         return None if array is None else array.astype(np.float64)
 
     def fits(self, name: str, array: np.ndarray, *shapes: tuple[int | None, ...]) -> bool:
-        """Whether `array` has one of `shapes`; notes it when not."""
+        """Tell whether `array` has one of `shapes`; note it when not."""
         for shape in shapes:
             if array.ndim == len(shape) and all(
                 want is None or want == size for want, size in zip(shape, array.shape, strict=True)
@@ -117,7 +117,7 @@ class Checker:
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
-        """(S, 3) or (3,) float64 [m]."""
+        """Return (S, 3) or (3,) float64 [m]."""
         if name not in self.raw.arrays:
             remedy = "; or say dataset.tx_position=[X,Y,Z]" if name == "tx_position" else ""
             return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}")
@@ -143,7 +143,7 @@ class Checker:
         return array
 
     def mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
-        """Bool, like the measurement; None when all was measured. Only `censored` rows may be empty."""
+        """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
         array = self.array("mask", shape)
         if array is None:
             return None
@@ -158,7 +158,7 @@ class Checker:
         return mask
 
     def frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
-        """(K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` of them (None without csi)."""
+        """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
         frequency = self.real("frequency_hz", (), (None,) if count is None else (count,))
         if count is not None and "frequency_hz" not in self.raw.arrays:
             fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
@@ -191,7 +191,7 @@ class Checker:
         return np.atleast_1d(frequency), float(frequency.mean() if carrier is None else carrier)
 
     def rotation(self, rows: int) -> np.ndarray | None:
-        """(S, 3, 3) local to world; the identity when the file says nothing."""
+        """Return (S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.given("rx_orientation", "rx_rotation")
         # Two statements of one rotation can disagree, and nothing says which is right.
         if len(present) == 2:
@@ -215,7 +215,7 @@ class Checker:
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
 
     def grid(self, height: int, width: int) -> SphereGrid | None:
-        """Directions of the pixels; row i, column j at i and j steps from the horizon by default."""
+        """Return directions of the pixels; by default row i, column j at i and j steps from the horizon."""
         if "grid_deg" not in self.raw.arrays:
             return SphereGrid.hemisphere(height, width)
         values = self.real("grid_deg", (4,))
@@ -235,7 +235,7 @@ class Checker:
         return SphereGrid(height, width, *(math.radians(v) for v in values))
 
     def ragged(self, rows: int) -> np.ndarray | None:
-        """path_offsets (S + 1,) int64."""
+        """Return path_offsets (S + 1,) int64."""
         per_path = self.given(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
         if per_path and "path_offsets" not in self.raw.arrays:
             return self.refuse("path_offsets", f"missing, but {per_path[0]} is given")
@@ -252,7 +252,7 @@ class Checker:
         return offsets.astype(np.int64)
 
     def release_split(self, rows: int) -> TrainTest | None:
-        """(train, test) rows that the file names, or None."""
+        """Return (train, test) rows that the file names, or None."""
         names = self.given("split_train", "split_test")
         if len(names) == 1:
             self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
@@ -279,7 +279,7 @@ UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this
 
 
 def is_unit(quaternion: np.ndarray) -> np.ndarray:
-    """Whether quaternions (..., 4) are finite and of length 1 within `UNIT_TOLERANCE`: (...) bool."""
+    """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...) bool."""
     return np.abs(_length(quaternion) - 1) <= UNIT_TOLERANCE
 
 
@@ -289,7 +289,7 @@ def _length(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
-    """Rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
+    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
 
     Raises:
         ValueError: a quaternion is not finite or its length differs from 1 by more than 1 %.
@@ -305,7 +305,7 @@ def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.nd
 
 
 def is_rotation(matrix: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
-    """Whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
+    """Tell whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
     # Products of huge or missing numbers are refused below, so that NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))

@@ -84,7 +84,7 @@ def read_query_places(
 
 
 def read_times(path: str | Path) -> np.ndarray | None:
-    """When each place was visited, (n,) [s], from the column or array `time_s`; None where there is none.
+    """Read when (n,) [s] each place was visited, column or array `time_s`; None where there is none.
 
     Raises:
         DataError: no such file, or a time that is no number, with its row.

@@ -101,7 +101,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
 
 
 def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Noted:
-    """The links of some stations only; the others' columns, or rows of a long file, are left out.
+    """Keep the links of some stations only; others' columns, or rows of a long file, are left out.
 
     Args:
         stations: names of `station_name`, or numbers from 0.
@@ -127,7 +127,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
 
 
 def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
-    """The rows of some runs only.
+    """Keep the rows of some runs only.
 
     Raises:
         DataError: the file names no runs, or not these.
@@ -143,7 +143,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
 
 
 def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
-    """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
+    """Keep powers of at least `min_rssi_db` [dB]; what is below is not measured, rather than not heard.
 
     Raises:
         DataError: the file holds no powers, or none is left.
@@ -170,7 +170,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
 
 
 def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
-    """At most `max_rows` rows that cover the campaign as all rows do.
+    """Keep at most `max_rows` rows, which cover the campaign as all rows do.
 
     The file's order is cut into `max_rows` stretches of equal length, and of each one row is drawn, with a
     fixed seed: every stretch of a walk stays, and rows of a raster are not hit in step with its lines, as
@@ -187,7 +187,7 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
 
 
 def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None = None) -> Arrays:
-    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits and paths follow.
+    """Take rows (n,), which may repeat, of all arrays with one for each of `count`, splits and paths too.
 
     Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
     reads them to refuse. Splits without rows are left out.
@@ -217,7 +217,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
 
 
 def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
-    """The same file with the stations (n,) only, in their order; one may stand twice.
+    """Return the same file with the stations (n,) only, in their order; one may stand twice.
 
     Rows of a long file stay as they are.
 
@@ -266,14 +266,14 @@ def _stations(raw: Raw, option: str, source: str | Path) -> int:
 
 
 def parts_of(number: int, names: Sequence[str]) -> list[int]:
-    """Numbers of a station and of what its level steps made of it (`station_parts`), in the order of rows."""
+    """Return numbers of a station and its parts by level steps (`station_parts`), in the order of rows."""
     if number >= len(names):
         return [number]
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
 def known_station(wanted: str | int, names: Sequence[str], count: int, option: str, file: str | Path) -> int:
-    """`station_number`; the setting `option` of a `file` is named in errors.
+    """Return `station_number`; errors name the setting `option` of a `file`.
 
     Raises:
         DataError: there is none.
@@ -294,7 +294,7 @@ def _measurement(raw: Raw, source: str | Path) -> str:
 
 
 def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
-    """Where the measurement says something, of its shape: NaN is missing, or, with a sensitivity, not heard.
+    """Tell where the measurement says something: NaN is missing, or, with a sensitivity, not heard.
 
     Raises:
         DataError: the file holds no measurement.
@@ -306,7 +306,7 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
 
 
 def per_station(name: str, array: np.ndarray, count: int) -> bool:
-    """Whether an array of a file has an entry for each of `count` stations."""
+    """Tell whether an array of a file has an entry for each of `count` stations."""
     return array.ndim in STATION_AXES.get(name, ()) and len(array) == count
 
 
@@ -344,7 +344,7 @@ def _check_rows(rows: np.ndarray, option: str, source: str | Path) -> None:
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:
-    """Each station of `steps` becomes several of the same place and kind, `NAME`, `NAME from row 1162`, ...
+    """Split each station of `steps` into several at one place, `NAME`, `NAME from row 1162`, ...
 
     Args:
         raw: arrays of a file, named as in docs/reference/schema.md.

@@ -43,7 +43,7 @@ class SceneWalls:
 
 
 def read_walls(path: str | Path | None) -> SceneWalls:
-    """Walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
+    """Read walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
 
     Raises:
         DataError: none is named, no such file, of another kind, or with walls that cannot be.
@@ -157,7 +157,7 @@ def _triangles_or_flat(face: np.ndarray) -> list[np.ndarray]:
 
 
 def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """The six faces, each (4, 3), of a box between two corners (3,)."""
+    """Return the six faces, each (4, 3), of a box between two corners (3,)."""
     faces = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -170,18 +170,18 @@ def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
 
 
 def normal_of(corners: np.ndarray) -> np.ndarray:
-    """Normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
+    """Return the normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
     # About the mean, as far from the origin the cross products would cancel each other.
     about = corners - corners.mean(0)
     return np.asarray(np.cross(about, np.roll(about, -1, axis=0)).sum(0))
 
 
 def area(corners: np.ndarray) -> float:
-    """Area of a polygon (C, 3) [m^2]."""
+    """Return the area of a polygon (C, 3) [m^2]."""
     return float(np.linalg.norm(normal_of(corners)) / 2)
 
 
 def uneven(corners: np.ndarray) -> float:
-    """Largest distance of corners (C, 3) from their plane [m]."""
+    """Return the largest distance of corners (C, 3) from their plane [m]."""
     normal = normal_of(corners)
     return float(np.abs((corners - corners.mean(0)) @ (normal / np.linalg.norm(normal))).max())

@@ -18,7 +18,7 @@ LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
-    """(topic, sentence) pairs about a dataset."""
+    """Return (topic, sentence) pairs about a dataset."""
     site, tones = data.site, data.site.subcarriers_hz
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
@@ -60,7 +60,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
 
 
 def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
-    """Five (topic, sentence) pairs about a dataset and how a run divides it."""
+    """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
     train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
     folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
     rows = f"{train} training, {val} validation and {test} test rows{folds}"
@@ -80,7 +80,7 @@ def _carrier(site: Site) -> str:
 
 
 def places_of(data: Measurements) -> np.ndarray:
-    """Places (n, 3) or (n, 6) [m], one of each visit."""
+    """Return places (n, 3) or (n, 6) [m], one of each visit."""
     return data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
 
 
@@ -95,7 +95,7 @@ def _targets(data: Measurements) -> str:
 
 
 def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
-    """How far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
+    """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
     distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
     text = f"the nearest other place is {np.median(distance):.3g} m away (median)"
     if wavelength is not None:
@@ -136,7 +136,7 @@ def _moving(data: Measurements) -> str:
 
 
 def suspicious_values(data: Measurements) -> list[str]:
-    """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
+    """Warn of readable but implausible values: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
     hints = []
     if not np.ptp(data.moving, axis=0).any():
@@ -218,7 +218,7 @@ APART = 3.0  # least side of a square, in distances of neighbours
 
 
 def side_of_squares(data: Measurements) -> float | None:
-    """Side [m] for `split=blocks`: a tenth of the site and several neighbours wide, a round number.
+    """Return a side [m] for `split=blocks`: a tenth of the site, several neighbours wide, round.
 
     None where the places are too few to hold squares of them out.
     """
@@ -235,7 +235,7 @@ def side_of_squares(data: Measurements) -> float | None:
 
 
 def held_out(data: Measurements, side: float) -> np.ndarray:
-    """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
+    """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
         split.check()
@@ -245,7 +245,7 @@ def held_out(data: Measurements, side: float) -> np.ndarray:
 
 
 def proposal(data: Measurements) -> str:
-    """One sentence for `gsparc check`."""
+    """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
     side = side_of_squares(data)
     if side is None or not len(held_out(data, side)):

@@ -91,7 +91,7 @@ def load_argos(
 
 
 def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
-    """Snapshots (S, A, K) without the mean delay and the phase of their uplink (its tones come first)."""
+    """Return snapshots (S, A, K) without mean delay and phase of their uplink (its tones come first)."""
     uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
     step = np.diff(numbers)[0]
     # Mean phase step between neighbouring tones, weighted by their power: a delay without unwrapping.
@@ -194,7 +194,7 @@ class Argos(Release):
         self.encoder = (room, EncoderSettings(**settings), file)
 
     def read(self, folder: Path) -> Measurements:
-        """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
+        """Read downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
         return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
@@ -207,6 +207,6 @@ class ArgosSim(Argos):
         super().__init__(None, name=name, stand_in=stand_in, **rest)
 
     def load(self) -> Measurements:
-        """As `Argos.load`, without a word about the release."""
+        """Load as `Argos.load` does, without a word about the release."""
         assert self.stand_in is not None
         return simulated(self.stand_in, self.called, self.read)

@@ -68,7 +68,7 @@ def understood(
     frequency_hz: float | Sequence[float] | None = None,
     **conventions: bool | None,
 ) -> Raw:
-    """The same with what settings say of the file.
+    """Return the same with what settings say of the file.
 
     Args:
         raw: as it was read.
@@ -110,13 +110,13 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind i
 
 
 def campaign_of(raw: Raw) -> str | None:
-    """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
+    """Return the choice of conf/dataset that reads a file with these arrays; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
     return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
 def release_of(path: Path) -> str | None:
-    """The choice of conf/dataset that reads a file or folder of its makers' release; None where none does."""
+    """Return the choice of conf/dataset that reads a release, file or folder; None where none does."""
     folder = path.is_dir()
     for kind in CAMPAIGNS:
         if path.suffix.lower() in kind.suffixes or (folder and kind.inside and any(path.glob(kind.inside))):
@@ -167,7 +167,7 @@ def raw_of(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
 ) -> Noted:
-    """The arrays of a file of the schema, or of a table, and how its columns were understood.
+    """Read the arrays of a file of the schema, or of a table, and how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.

@@ -35,7 +35,7 @@ STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
 def planar_array(rows: int = 4, columns: int = 4, spacing_m: float = 0.16) -> np.ndarray:
-    """Element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
+    """Return element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
     x = (np.arange(columns) - (columns - 1) / 2) * spacing_m
     y = (np.arange(rows) - (rows - 1) / 2) * spacing_m
     grid_x, grid_y = np.meshgrid(x, y)
@@ -235,5 +235,5 @@ class RFID(Release):
     )
 
     def read(self, folder: Path) -> Measurements:
-        """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""
+        """Read spectra (S, 90, 360) uint8 of tags about a static gateway; stand-ins have no settings."""
         return super().read(folder) if folder == self.root else load_rfid(folder)

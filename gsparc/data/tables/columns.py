@@ -45,7 +45,7 @@ class Column(Head):
     value: tuple[float, ...] = ()
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
-        """(S,) float64 in the schema's unit, NaN where there is no value; None, and noted, where unusable."""
+        """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
@@ -65,7 +65,7 @@ def choose(
     labelled: Iterable[str] = (),
     only: Container[str] | None = None,
 ) -> tuple[Chosen, list[str]]:
-    """The columns of each quantity, and a note for each that was guessed.
+    """Choose the columns of each quantity, with a note for each that was guessed.
 
     Args:
         sheet: the table.
@@ -346,14 +346,14 @@ def _note(columns: tuple[Column, ...]) -> str:
 
 
 def schema_unit(column: Column) -> str:
-    """Unit of the column's values once they are read."""
+    """Return the unit of the column's values once they are read."""
     unit = SCHEMA.get(KINDS[column.role], "deg")
     # dB are levels without a reference; calling them dBm would invent one.
     return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
 
 
 def as_station(column: Column) -> Column:
-    """The same column of a list of stations, where ends need not be named."""
+    """Return the same column of a list of stations, where ends need not be named."""
     axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
     return column if axis is None else replace(column, role=f"station_{axis}")
 

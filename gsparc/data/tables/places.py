@@ -34,16 +34,16 @@ class Places:
     degrees: bool
 
     def all(self) -> np.ndarray:
-        """(n, 2) or (n, 3)."""
+        """Return (n, 2) or (n, 3)."""
         return self.across if self.height is None else np.column_stack([self.across, self.height])
 
     def take(self, rows: np.ndarray) -> Places:
-        """Those of some rows."""
+        """Return those of some rows."""
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
 def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
-    """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it.
+    """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
 
     Where places may be `unknown`, rows without any coordinate are NaN.
     """
@@ -113,7 +113,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
 def one_each(
     sheet: Sheet, row_places: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
 ) -> Places | None:
-    """The place of each station, which must be the same in all its rows; None, and noted, when it is not.
+    """Return the place of each station, the same in all its rows; None, and noted, when it is not.
 
     Args:
         sheet: for the names of rows.
@@ -160,14 +160,14 @@ class StationList:
     aliases: tuple[tuple[str, ...], ...] = ()
 
     def called(self, words: np.ndarray) -> StationList:
-        """The same under the names that most of words (S,) are of, its own first."""
+        """Return the same under the names that most of words (S,) are of, its own first."""
         known = set(words.tolist())
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
         return replace(self, names=names)
 
     def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
-        """The same with those of words (S,) that it lacks, if few, at unknown places; these, and a note."""
+        """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
         names = [word for word in dict.fromkeys(words.tolist()) if word]
         lost = [word for word in names if word not in self.names]
         # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
@@ -188,7 +188,7 @@ class StationList:
 
 
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
-    """The stations of a table: name, and x, y, z or latitude, longitude, height, empty where nobody knows."""
+    """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
     naming = [head for head in sheet.heads if head and understand(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too

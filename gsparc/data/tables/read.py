@@ -36,7 +36,7 @@ def understand_table(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
 ) -> Noted:
-    """The arrays of a table, and what was guessed.
+    """Read the arrays of a table, and what was guessed.
 
     Args:
         path: *.csv, *.tsv, *.txt or *.parquet, or several.
@@ -92,7 +92,7 @@ class Builder:
         self.tones, self.zones = np.zeros(1, int), ""
 
     def build(self) -> dict[str, np.ndarray]:
-        """All arrays; what is wrong is in `sheet.problems`."""
+        """Return all arrays; what is wrong is in `sheet.problems`."""
         measured = self._measurement()
         # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
