@@ -152,7 +152,7 @@ def _layers(width: int, hidden: int, out: int) -> nn.Sequential:
 
 
 def spread(codes: Tensor) -> Tensor:
-    """Return the mean of -log of the distance from codes (B, 3) to the nearest other; small where they fill space.
+    """Return the mean of -log of the distance of codes (B, 3) to the nearest other: small, they fill space.
 
     Minus the entropy of Kozachenko and Leonenko (1987), up to constants.
     """
