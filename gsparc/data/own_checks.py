@@ -55,7 +55,7 @@ class Checker:
                 if unit != FIELDS[name].unit:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 continue
-            # Names that are there themselves are not what a misspelt one was to be.
+            # A name that the file holds, too, cannot be what the misspelt one was to be.
             close = [n for n in difflib.get_close_matches(name, FIELDS, n=3) if n not in self.raw.arrays]
             if close:
                 self.refuse(name, f"unknown name; did you mean {close[0]}?")

@@ -24,7 +24,6 @@ RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
 # Thresholds that are tried: more of them resolve finer, but each one may end the search.
 LEVELS = 50
-# Level of the bound on a design effect that few patches tell: a higher one promises less.
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
@@ -369,7 +368,6 @@ def trials(
     """
     realised, coverage, kinds = [], [], []
     bad = promise.bad(evidence.error)
-    # A seed for each draw: the first ones are the same however many follow.
     for draw in range(draws):
         used, threshold, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
         accepted = test[evidence.scores[used][test] >= threshold.value]
