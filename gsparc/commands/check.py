@@ -13,7 +13,6 @@ from rich.console import Console
 from gsparc.data.errors import Caution, DataError, gathered
 
 SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
-NUMBER = re.compile(r"[-+]?[.\d]+(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
 def check(
@@ -82,8 +81,12 @@ def _value(text: str) -> Any:
     """A setting's numbers, truth value or word."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
-    numbers = [float(one) for one in NUMBER.findall(text)]
-    return numbers if text.startswith("[") else numbers[0] if numbers else text
+    words = [one.strip() for one in text.strip("[]").split(",")] if text.startswith("[") else [text]
+    try:
+        values: list[Any] = [float(one) for one in words]
+    except ValueError:  # words as they are: a path has dots, a level may have its unit
+        values = words
+    return values if text.startswith("[") else values[0]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

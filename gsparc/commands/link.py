@@ -72,7 +72,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     rates = [
         [
             f"{level:g}",
-            *(shown(facts.get(f"mcs/{level:.0f}dB/{key}"), form) for key, (_, form) in RATES.items()),
+            *(shown(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
         ]
         for level in levels
     ]

@@ -55,7 +55,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
     # Refused before evidence is gathered, which takes minutes.
-    geotiff_wanted(config.geotiff, predictor.site.georeference)
+    origin = predictor.site.georeference
+    geotiff_wanted(config.geotiff, origin)
+    if config.degrees and origin is None:
+        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
     promise = promise_of(str(config.ckpt), settings)
     field = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
@@ -64,9 +67,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    origin = predictor.site.georeference
-    if config.degrees and origin is None:
-        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
     for layer in sheets if config.pictures else ():
         draw_layer(field, layer, run_dir / file_name(layer), title, floor, origin if config.degrees else None)
     if origin is not None and geotiff_wanted(config.geotiff, origin):

@@ -165,6 +165,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     partial = _partial(path)
+    shutil.rmtree(partial, ignore_errors=True)  # of a killed process, whose number this one has again
     partial.mkdir(parents=True)
     try:
         yield partial

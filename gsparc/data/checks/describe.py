@@ -96,6 +96,8 @@ def _targets(data: Measurements) -> str:
 
 def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
+    if len(positions) < 2:
+        return "one place alone"
     distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
     text = f"the nearest other place is {np.median(distance):.3g} m away (median)"
     if wavelength is not None:
@@ -222,7 +224,7 @@ def side_of_squares(data: Measurements) -> float | None:
 
     None where the places are too few to hold squares of them out.
     """
-    places = np.unique(data.moving[:, -3:], axis=0)[:, :2]
+    places = np.unique(data.moving[:, :3], axis=0)[:, :2]  # as `split=blocks` cuts squares, of both ends too
     extent = float(np.ptp(places, axis=0).max()) if len(places) > 1 else 0.0
     if extent == 0:
         return None
