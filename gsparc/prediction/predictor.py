@@ -277,7 +277,7 @@ class Predictor:
         return stations
 
     def cycling(self, places: np.ndarray) -> Call:
-        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
+        """Return calls for a clock: one place of the moving end (n, 3) [m, world] each, another every time.
 
         Of several stations the first that the model answers for is asked.
         """

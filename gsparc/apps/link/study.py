@@ -129,7 +129,7 @@ def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray) -> dict[
     facts: dict[str, Any] = {}
     for rule, ones in rates.items():
         for one in ones:
-            stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
+            stem = f"mcs/{one.snr_db:g}dB" + ("" if rule == "expected" else f"/{rule}")
             facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted).items()}
     return facts
 
