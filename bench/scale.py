@@ -20,6 +20,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,8 @@ def aside(work: Callable[[], Any]) -> None:
     if child == 0:
         try:
             work()
+        except Exception:
+            traceback.print_exc()
         finally:
             # Without cleanup: handlers of the parent must not run in the child.
             os._exit(0)

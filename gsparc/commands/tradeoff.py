@@ -59,7 +59,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     candidates = [(some, reduced(method, some, measured)) for some in settings]
     others = tradeoff.others_of(run, config.baselines, config.peers, config.ckpt, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
-    places = data.moving[rows] + data.site.origin
+    places = data.moving[rows]
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}

@@ -84,9 +84,9 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     if not side.any():
         return {}
     level = data.target[scores.row, 0].astype(np.float64) * data.site.target_scale
-    # A prediction of 0 has no logarithm: as the smallest float64 it exceeds no level of a silent row.
-    tiny = np.finfo(np.float64).tiny
-    beyond = side * 10 * np.log10(np.maximum(prediction, tiny) / np.maximum(level, tiny))
+    # A prediction of 0 has no logarithm: it is the weakest level, as in `PowerMetrics`.
+    floor = level[level > 0].min() if (level > 0).any() else np.finfo(np.float64).tiny
+    beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
     error = np.where(side == 0, scores.samples["error_db"], np.maximum(beyond, 0.0))
     return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
 

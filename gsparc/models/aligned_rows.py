@@ -94,31 +94,39 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
         len(known), words(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
-    train, val = (averaged(data, target, rows) for rows in (fold.train, fold.val))
     turned = replace(
         data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
     )
+    train, turned = averaged(turned, fold.train)
+    val, turned = averaged(turned, fold.val)
     result = turned, Fold(train, val, fold.test)
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
 
 
-def averaged(data: Measurements, target: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the first of `rows` at each place and station, whose `target` (S, A, K) becomes their mean."""
+def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
+    """Return the first of `rows` at each place and station, and measurements where these are the means."""
     if not len(rows):
-        return rows
+        return rows, data
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-    _, first, packet = np.unique(
-        np.c_[data.moving[rows], station], axis=0, return_index=True, return_inverse=True
-    )
+    _, first, packet, count = np.unique(
+        np.c_[data.moving[rows], station],
+        axis=0, return_index=True, return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    first, packet, target = rows[first], packet.reshape(-1), np.array(data.target)
     measured = np.ones_like(target[rows], bool) if data.mask is None else data.mask[rows]
-    packet = packet.reshape(-1)
-    total = np.zeros((len(first), *target.shape[1:]), target.dtype)
-    count = np.zeros(total.shape)
+    total, several = np.zeros((2, len(first), *target.shape[1:]), target.dtype)
     np.add.at(total, packet, np.where(measured, target[rows], 0))
-    np.add.at(count, packet, measured)
-    target[rows[first]] = total / np.maximum(count, 1)
-    return np.sort(rows[first])
+    np.add.at(several, packet, measured)
+    target[first] = total / np.maximum(several.real, 1)
+    mask, noise = data.mask, data.noise_variance
+    if mask is not None:
+        mask = np.array(mask)
+        mask[first] = several.real > 0  # an entry that any of the packets measured
+    if noise is not None:
+        noise = np.array(noise)
+        noise[first] /= count.reshape(-1, *[1] * (noise.ndim - 1))
+    return np.sort(first), replace(data, target=target, mask=mask, noise_variance=noise)
 
 
 def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
@@ -142,6 +150,8 @@ _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measuremen
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    if len(rows.values) == 1:  # a row alone has no other to be turned to
+        return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)

@@ -8,6 +8,7 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
@@ -277,7 +278,8 @@ class PerStation(Method):
         receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3)
         ends = query.tx if self.site.static_end == "tx" else receiver
         table = torch.from_numpy(self.site.stations.position)
-        distance = torch.cdist(ends.detach().cpu().double(), table)
+        # A station at an unknown place is nearest to none: NaN would be the least of every row.
+        distance = torch.cdist(ends.detach().cpu().double(), table).nan_to_num(math.inf)
         apart, number = distance.min(dim=1)
         shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
         if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers

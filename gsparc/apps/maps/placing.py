@@ -165,9 +165,12 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStation:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
         parts.append(evidence_of(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
+    parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
+    if not parts:
+        return NewStation()
     errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
-    means = np.array([error.mean() for error in errors if len(error)])
-    pairs = zip(errors, means, parts, strict=False)
+    means = np.array([error.mean() for error in errors])
+    pairs = zip(errors, means, parts, strict=True)
     inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
     within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
     return NewStation(float(np.sqrt(np.mean(means**2))), within, len(means))

@@ -10,15 +10,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.metric_formats import heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
-SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
-SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
+SECOND: dict[Scored, str] = {
+    "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
+}  # fmt: skip
+SCORE = {
+    "psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "nmse_aligned": "-10 log10 NMSE, dB",
+    "rmse_db": "-RMSE dB",
+}  # fmt: skip
 # Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, by their columns
@@ -216,7 +221,8 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     }
     if draws:
         columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
-    if figure == "nmse" or (figure == "rmse_db" and not draws):  # else it is the score but for its sign
+    # Of the others it is the score but for its sign.
+    if figure.startswith("nmse") or (figure == "rmse_db" and not draws):
         columns[figure] = column("value", ".3g" if draws else ".4g", "value_error")
     columns[block.second.iloc[0]] = column("second_value", ".4g")
     for name, head, form in (
@@ -254,7 +260,7 @@ def overview(rows: pd.DataFrame) -> str:
 
 
 def _cell(row: Any) -> str:
-    form = ".3f" if row.figure == "nmse" else ".2f"
+    form = ".3f" if row.figure.startswith("nmse") else ".2f"
     value = f"{row.value:{form}}"
     if not np.isnan(row.value_error):
         value += f" ± {row.value_error:{form}}"

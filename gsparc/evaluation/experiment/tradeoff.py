@@ -58,7 +58,7 @@ def sweep(
     figure, split = DECIDING[data.site.scored], Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
     whole = None
-    places = data.moving[rows_of(fold, eval_on)] + data.site.origin
+    places = data.moving[rows_of(fold, eval_on)]
     for number, (_, method) in enumerate(candidates):
         recorded = Recorded(method)
         there = score([recorded], data, split, eval_on)

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
@@ -25,8 +25,9 @@ from gsparc.models.pareto import front
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
 TIMES = "render_ms"  # of single queries, beside the figures of samples
-CDFS: dict[Kind, tuple[str, ...]] = {
-    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
+CDFS: dict[Scored, tuple[str, ...]] = {
+    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"),
+    "aligned csi": ("snr_db", "error_power"), "rssi": ("error_db",),
 }  # fmt: skip
 
 

@@ -236,9 +236,7 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
-        # In the world's coordinates: a Predictor takes the origin off again.
-        places = opened.data.moving[opened.split.folds[0].test] + opened.data.site.origin
-        calls[number] = opened.predictor.cycling(places)
+        calls[number] = opened.predictor.cycling(opened.data.moving[opened.split.folds[0].test])
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }

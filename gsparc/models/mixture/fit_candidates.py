@@ -103,9 +103,7 @@ def fit_all(
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = comparable(data.batch(field.held.rows).target, data.site)
-                one = Race.of(
-                    field.held.rows, comparable(field.held.mean, data.site), target, note, context.effort
-                )
+                one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
                 if race is None or part not in SEARCHES:
                     note(name, float(one.squared.mean()))
                 else:
