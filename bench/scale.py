@@ -20,6 +20,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from gsparc.training.context import FitContext
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
 CHANNELS = ("mean", "nearest", "complex_gp")
 SPECTRA = ("mean", "idw", "gp", "gsparc")
+# Single queries have no batch to share their overhead: 40 are enough for a mean.
 SINGLE = 40  # queries asked one by one, for the time of one
 HEAD = (
     "source", "method", "label", "rows", "fit_cpu_s", "fit_wall_s", "query_cpu_ms", "rmse", "rmse_error",
@@ -48,7 +50,7 @@ HEAD = (
 
 
 def make(name: str) -> MethodFactory:
-    """What makes the method, with what `model=` sets."""
+    """Return what makes the method, with what `model=` sets."""
     from hydra import compose, initialize_config_module
 
     from gsparc.models.registry import build
@@ -77,15 +79,18 @@ def peak_gb() -> float:
 
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
-    """A line of one method."""
+    """Write a line of one method."""
     before, private, factory = peak_gb(), Private(), for_stations(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
+        # Both clocks: seconds of the processor do not count what others do meanwhile.
         cpu, wall = time.process_time(), time.perf_counter()
+        # All stations are one fit, as rows are what is varied here.
         context = FitContext(Path(folder), stations="together")
         method, _ = fitting.fit(factory, data, fold, context)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     missed = []
+    # 256 rows a batch, as targets and predictions of spectra are held beside each other.
     for part in np.array_split(fold.test, -(-len(fold.test) // 256)):
         batch = data.batch(part)
         missed.append(error(method.predict(batch).mean.numpy(), batch.target.numpy()))
@@ -96,6 +101,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
     for one in ones:
         method.predict(one)
     query = (time.process_time() - began) / SINGLE * 1e3
+    # d sqrt(m) = dm / (2 sqrt(m)): the standard error of a root of a mean.
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
     values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
@@ -106,7 +112,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
 def each(
     source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any]
 ) -> None:
-    """A line of every method, each fitted in a child that the measurements are shared with."""
+    """Write a line of every method, each fitted in a child that shares the measurements."""
     for name in methods:
         make(name)  # imports it, so that no child does
     for name in methods:
@@ -115,11 +121,15 @@ def each(
 
 def aside(work: Callable[[], Any]) -> None:
     """Do something in a child, whose memory is then no longer held."""
+    # fork, not spawn: the child shares the measurements' memory, which is then counted once.
     child = os.fork()
     if child == 0:
         try:
             work()
+        except Exception:
+            traceback.print_exc()
         finally:
+            # Without cleanup: handlers of the parent must not run in the child.
             os._exit(0)
     os.waitpid(child, 0)
 
@@ -134,6 +144,7 @@ def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) 
     for count in counts:
         data = {"town": town, "city": city}[source](count)
         rows = np.arange(count + TESTED)
+        # Validation rows first, test rows last, which are the same whatever the count.
         fold = Fold(rows[count // 10 : count], rows[: count // 10], rows[count:])
         each(source, methods, data, fold, decibels)
 
@@ -155,6 +166,7 @@ def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNEL
         sys.stderr.write(
             f"{count} rows read in {read[0]:.1f} s, peak {read[1]:.2f} GB, file {read[2]:.2f} GB\n"
         )
+        # Every fourth test row: one is 16 x 64 complex entries, and 500 tell the error well enough.
         fold = Fold(rows[:count], rows[:0], rows[-TESTED::4])
         each("hall", methods, data, fold, relative)
         path.unlink()
@@ -175,13 +187,14 @@ def spectra(folder: Path, counts: Sequence[int], methods: Sequence[str] = SPECTR
     spent = time.process_time() - began
     sys.stderr.write(f"{len(data)} spectra read in {spent:.1f} s, {private.most:.2f} GB private\n")
     for count in counts:
+        # Another seed for each count, test rows stay out of the draw.
         rows = np.random.default_rng(count).permutation(whole - TESTED)[:count]
         fold = Fold(np.sort(rows[count // 10 :]), np.sort(rows[: count // 10]), np.arange(whole)[-TESTED::4])
         each("spectra", methods, data, fold, squares)
 
 
 def main(kind: str, *rest: str) -> None:
-    """See the head of this file."""
+    """Do what the head of this file says."""
     counts = [int(word) for word in rest[1:] if word.isdigit()]
     methods = [word for word in rest[1:] if not word.isdigit()]
     if kind == "powers":

@@ -21,7 +21,7 @@ PANELS = {
 
 
 def slope(lines: pd.DataFrame, figure: str) -> float:
-    """Of a figure against rows, both as logarithms, least squares from `MANY` rows on; NaN of one point."""
+    """Return the slope of a figure over rows, both as logarithms, from `MANY` rows on; NaN of one point."""
     many = lines[lines["rows"] >= MANY]
     if len(many) < 2:
         return float("nan")
@@ -29,7 +29,7 @@ def slope(lines: pd.DataFrame, figure: str) -> float:
 
 
 def draw(tables: Path, pictures: Path) -> None:
-    """A picture for each source that was measured."""
+    """Save a picture for each source that was measured."""
     for kind, quantities in PANELS.items():
         path = tables / f"{kind}.csv"
         for source, own in pd.read_csv(path).groupby("source", sort=False) if path.exists() else ():
@@ -47,6 +47,7 @@ def draw(tables: Path, pictures: Path) -> None:
 def _curves(place: Axes, lines: pd.DataFrame, quantity: str) -> None:
     """A figure of every method against rows; slopes of seconds stand in the legend."""
     for name, own in lines.sort_values("rows", kind="stable").groupby("method", sort=False):
+        # Two standard errors, about 95 %.
         errors = 2 * own["rmse_error"] if quantity == "rmse" else None
         exponent = slope(own, quantity) if quantity == "fit_cpu_s" else float("nan")
         label = name if np.isnan(exponent) else f"{name}, slope {exponent:.2f}"

@@ -53,7 +53,7 @@ def shadowed(places: np.ndarray, station: np.ndarray, shadows: np.random.Generat
 
 
 def city(count: int) -> Measurements:
-    """The same of a measured city: places about measured ones, powers those that a process of them predicts.
+    """Return the same of a measured city: places about measured ones, powers by a process of them.
 
     Its noise is drawn anew. Measured powers drawn again and again would share the noise they were measured
     with, and no number of rows would take that away.

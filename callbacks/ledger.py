@@ -67,6 +67,7 @@ class CostLedger(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Start the watch; the curve of an interrupted run ends with the checkpoint that it goes on from."""
         if trainer.is_global_zero and trainer.global_step:
+            # Rows after the checkpoint are of steps that are taken again.
             self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
             curve.write(module.run_dir, self._rows)
         self._start()
@@ -85,9 +86,11 @@ class CostLedger(L.Callback):
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""
+        # `trainer.validate` by itself is no training: neither a row of the curve nor a running watch.
         fitting = trainer.state.fn == "fit"
         if trainer.is_global_zero and fitting and module.figures:
             self._note(trainer, module)
+        # Lightning's check of validation comes before the first step: nothing is learned yet.
         if fitting and not trainer.sanity_checking:
             self._start()
 

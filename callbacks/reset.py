@@ -62,6 +62,7 @@ class OpacityReset(Checked, L.Callback):
             left = module.total_steps - step
             log.info("no opacity reset at step %d: %d steps are too few to recover in", step, left)
             return
+        # The logit of the ceiling: opacities are stored as logits.
         field, ceiling = module.model.gaussians, math.log(self.ceiling / (1 - self.ceiling))
         with torch.no_grad():
             lowered = field.opacity_logits > ceiling

@@ -53,6 +53,7 @@ def tiles(settings: KernelSettings) -> int:
 
 def _with_headroom(entries: int) -> int:
     """Capacity of a captured plan where the largest plan so far had so many entries."""
+    # A quarter more, since a captured graph cannot grow when Gaussians move.
     return entries + entries // 4 + 1024
 
 
@@ -73,6 +74,7 @@ def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) 
 
 def capacity_of(plan: Plan) -> int:
     """Return how many entries a plan has room for."""
+    # Of `entries`: the tiles' starts first, then two numbers for each entry.
     return (plan.buffers.entries.numel() - plan.num_poses * tiles(plan.settings) - 1) // 2
 
 
@@ -93,6 +95,7 @@ def run_on_plan(
 @kernel("plan", "cuda")
 def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, count, n, buffers = gaussians.means, plan.num_poses, plan.num_gaussians, plan.buffers
+    # Before anything is allocated: an overflow in 32 bits would write out of bounds.
     if count * n >= MOST_PAIRS:
         raise MemoryError(
             f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
@@ -124,6 +127,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
 
 def _by_gaussian(features: Tensor, poses: int) -> Tensor:
     """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
+    # One pose is seen by all samples: their channels side by side share its weights.
     if poses != 1:
         return features.contiguous()
     samples, n, channels = features.shape
@@ -198,6 +202,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     blocks = means.new_zeros(capacity, pixels)
     starts = buffers.entries[: tiles(plan.settings) + 1].clone()
     ends = starts[:-1].clone()
+    # The kernel moves each end to the first entry of its tile that no pixel sees.
     if len(means) > 0:
         run_on_plan("weights", plan, gaussians, None, blocks, ends)
     order = buffers.order[0, : int(buffers.shown[0])].to(torch.int64)

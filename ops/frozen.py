@@ -43,6 +43,7 @@ class FrozenPlan:
             RuntimeError: under `torch.func` and in forward mode, where a constant would be no answer.
             ValueError, TypeError: features of another number, dtype or device, or (on the CPU) not finite.
         """
+        # The field's own counter: that of a tensor misses writes through `.data`.
         if version != self.version:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"

@@ -202,6 +202,7 @@ def _weights_gradient(
     plan: Plan, grad_seen: Tensor | None, grad_total: Tensor | None, *parts: Tensor
 ) -> Gaussians:
     gaussians, size = Gaussians(*parts), (plan.num_poses, plan.num_gaussians)
+    # The kernel reads both slopes: one that nothing depends on is 0.
     slopes = [gaussians.means.new_zeros(size) if s is None else s for s in (grad_seen, grad_total)]
     return fill("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
 

@@ -66,6 +66,7 @@ def _plan(
     backend: str | None,
 ) -> Plan:
     """`make_plan` of Gaussians whose shapes agree."""
+    # Read before `plain`, which takes gradients off: a pose's would then be none without a word.
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.transforms(gaussians, pose, pose_trained)
     chosen = backends.choose(backend, gaussians.means.device)
@@ -168,6 +169,7 @@ def rasterize(
     inputs = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
+    # Only without gradients: one call keeps no plan that a backward pass could read.
     if at_once is not None and not followed(*inputs):
         poses = validation.poses(pose, means)
         values = validation.features(features, means, poses)
@@ -191,6 +193,7 @@ def mean_weights(
         ValueError, TypeError, RuntimeError: as `composite`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    # Called for its refusal of plans that were made in inference mode.
     _trained(plan, *gaussians)
     backend = reference_by_rows if beyond_kernels(*gaussians) else backends.named(plan.backend)
     return Weights(*backend.mean_weights(plan, gaussians))
@@ -219,6 +222,7 @@ def freeze(
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    # To `torch.func` a frozen view would be a constant, its derivative 0 without a word.
     if beyond_kernels(*gaussians):
         raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")
     order, buffers = backends.named(plan.backend).freeze(plan, gaussians)

@@ -26,6 +26,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
         alpha, _ = reference.layers(seen, shapes, strongest, strongest, optics)
         orders.append(reference.depth_order(seen, ids))
+        # An absent Gaussian, such as one at the receiver, has no centre that may be read.
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
         visible.append((alpha > 0).any(1))
         if ids is not None:
@@ -54,6 +55,7 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
         images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
         transmittances.append(transmittance)
     size = (plan.grid.height, plan.grid.width)
+    # No poses: images of no rows that all the same depend on the tensors, with a gradient of 0.
     none = _nothing(*gaussians, features)
     image = torch.cat(images) if images else none.expand(0, features.shape[2], size[0] * size[1])
     transmittance = _stacked(transmittances, none.expand(0, size[0] * size[1]))
@@ -84,6 +86,7 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 @full_precision
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Return the depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
+    # No shift of centres: a view is frozen for inference.
     no_shift = torch.zeros_like(plan.means2d)
     weights, _, _ = _weights(plan, 0, gaussians, no_shift)
     return plan.buffers[0][0], (weights,)

@@ -17,6 +17,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def full_precision(function: _Function) -> _Function:
     """Keep `function` in the precision of its tensors, as the kernels are, under `torch.autocast` too."""
+    # Autocast would render in half precision: 5 % off, and sound rotations refused.
     exact = torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(function))
     return cast(_Function, exact)
 
@@ -36,6 +37,7 @@ def carries_tangent(*values: Any) -> bool:
 
 def mapped(*values: Any) -> bool:
     """Tell whether `torch.vmap` has hidden an axis of a tensor among `values`."""
+    # Looked for only while a transform is under way: this is asked at every call.
     for value in values if transforming() else ():
         # Transforms wrap each other's tensors: every layer is looked at.
         while isinstance(value, Tensor) and _functorch.is_functorch_wrapped_tensor(value):

@@ -26,6 +26,7 @@ class Field:
 
     def __init__(self, path: str | Path, library: str | Path) -> None:
         self._c = ctypes.CDLL(str(library))
+        # Pointers must be said to be pointers: an int, ctypes' default, cuts off their upper 32 bits.
         self._c.gsparc_load.restype = self._c.gsparc_free.restype = ctypes.c_void_p
         self._c.gsparc_about.restype = Facts
         for call, count in (("about", 1), ("free", 1), ("query", 6)):
@@ -35,12 +36,14 @@ class Field:
         if not self._field:
             raise ValueError(f"{path}: {why.value.decode()}")
         self.facts = self._c.gsparc_about(self._field)
+        # NumPy aligns to 16 bytes: a line more, of which the first multiple of 64 is taken.
         self._memory = np.empty(self.facts.scratch + LINE, np.uint8)
         self._scratch = -(-self._memory.ctypes.data // LINE) * LINE
 
     def __call__(self, place: np.ndarray) -> tuple[np.ndarray, float, float]:
         """The answer at (3,) [m], or (6,) of both ends; its variance, and the share that is unknown."""
         facts = self.facts
+        # In float64, since float32 of UTM metres moves in steps of half a metre.
         local = np.asarray(place, np.float64) - np.tile(facts.origin[:], facts.axes // 3)
         at, values, doubt = (
             local.astype(np.float32),

@@ -46,6 +46,7 @@ class GPyTorch(Interpolator):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         parts: Components = principal_components(targets, self.kind, self.components)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
+        # One unit for all components, since they share a kernel and its scale.
         self.unit = float(parts.scores.std())
         self.x, self.y = torch.from_numpy(positions), torch.from_numpy(parts.scores.T / self.unit)
         model, began = self._model(), time.perf_counter()
@@ -75,6 +76,7 @@ class GPyTorch(Interpolator):
         with torch.no_grad(), gpytorch.settings.fast_pred_var():
             asked = torch.from_numpy(queries).expand(len(self.y), -1, -1)
             found = self._ready(asked)
+            # Of the prior's variance: 0 at measured places, 1 where nothing is known.
             scores, spread = found.mean.T * self.unit, found.variance.mean(0) / self._ready.kernel.outputscale
         mean = self._decode(self.mean + scores.float() @ self.axes)
         return Prediction(mean, unknown=spread.clamp(0, 1).float())

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+# 1 kHz, a channel a millisecond: two slots of 5G NR at 30 kHz.
 PERIOD_S = 1e-3
 SPIN_S = 2e-4  # before a tick the loop does not sleep: a sleep ends late by as much
 SPEED = 1.5  # [m/s]
@@ -53,6 +54,7 @@ class Run:
 def play(answer, centre: np.ndarray, seconds: float, period_s: float = PERIOD_S) -> Run:
     """Ask for a place each period; a tick that passes while an answer is computed is missed, not made up."""
     ticks, latency, missed, tick = int(seconds / period_s), [], 0, 0
+    # 10 ms ahead, so that the first tick is not late by what comes before the loop.
     start = time.perf_counter() + 0.01
     while tick < ticks:
         due = start + tick * period_s
@@ -77,6 +79,7 @@ def main(arguments: list[str]) -> int:
         return 2
     field = example("field").Field(*arguments[:2])
     centre = np.array([float(word) for word in arguments[2:5]])
+    # Once before the clock runs: a first query finds cold caches.
     field(centre)
     run = play(field, centre, float(arguments[5]) if len(arguments) == 6 else 20.0)
     field.close()

@@ -22,21 +22,24 @@ from gsparc.prediction.timing import ClockSettings, machine_facts, peak_memory
 
 log = logging.getLogger(__name__)
 
+# For tests and a first look: every case runs, and no time of it means anything.
 QUICK = {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
 ROWS = ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "kernel / limit")
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Time all cases and promises; return the facts written to `summary.json` in the run directory."""
     if config.quick:
         config = config.copy()
         config.update(QUICK)
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
+    # The load before anything ran: afterwards it is this program's own.
     machine, before, rows = Machine(), machine_facts()["machine/load"], list[Row]()
     gc.collect()
     gc.freeze()  # what the imports left behind is not searched again in the middle of a call
     for case in cases(config.counts, config.projections, config.batches):
         for turn, threads in enumerate(config.threads):
+            # References in plain PyTorch are slow, and are timed with one number of threads alone.
             references = turn == 0 and not config.quick
             rows.append(measure(case, machine, threads, clock, references=references))
         log.info("%s: %.3g ms, %.1f x the limit", case.key, float(rows[-1].kernel.mean()), rows[-1].over)
@@ -55,6 +58,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, console = run_directory(), open_console()
     write_summary(run_dir / "summary.json", summary)
     tables = rows_table(rows), claims_table(promises)
+    # Promises first: whether they hold is what the page is opened for.
     (run_dir / "bench.md").write_text(page(summary, tables[::-1]), encoding="utf-8")
     tables[0].title = f"{summary['machine/cpu']}, {summary['machine/instruction_set']}"
     console.print(*tables, sep="\n")
@@ -62,7 +66,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def rows_table(rows: Sequence[Row]) -> Table:
-    """Every row: time, limit, ratio."""
+    """Return a table of every row: time, limit, ratio."""
     sheet = table("", ["operation", "projection"], ROWS, [])
     sheet.caption = "ms, median; limit: see gsparc/prediction/bench/measure.py"
     for row in rows:
@@ -75,7 +79,7 @@ def rows_table(rows: Sequence[Row]) -> Table:
 
 
 def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
-    """Every promise and whether it holds here."""
+    """Return a table of every promise and whether it holds here."""
     sheet = table("Promises", ["promise", "where"], ["ratio", "promised", "met"], [])
     for where, claim in claims:
         bound = f"{'at least' if claim.at_least else 'at most'} {claim.bound:g}"
@@ -85,7 +89,7 @@ def claims_table(claims: Sequence[tuple[str, Claim]]) -> Table:
 
 
 def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
-    """Tables as Markdown, under the machine, its load and the commit they were measured at."""
+    """Return tables as Markdown, under the machine, its load and the commit they were measured at."""
     load = f"load per core {facts['machine/load_before']:.2f} before and {facts['machine/load']:.2f} after"
     head = f"{facts['machine/cpu']}, {facts['machine/instruction_set']}, {facts['machine/cores']} cores"
     lines = [f"# {head}, {load}, commit {facts['git']}"]

@@ -27,6 +27,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = plain(config)
     evidence, known = collect(paths, settings["dataset"], settings["split"])
+    # Refused here, before hundreds of draws would fail in the same way.
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
@@ -35,9 +36,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     try:
         divisions.append(trials(evidence, promise, "spatial", *draws))
     except ValueError:
+        # With fewer patches than parts no division by whole cells exists.
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
     facts = known | figures(evidence, divisions, promise) | machine_facts() | provenance()
     facts["seed"] = config.seed
+    # Written before a threshold is stored: where storing fails, these figures are there.
     write_summary(run_dir / "summary.json", facts)
     title = f"{known['dataset/name']}, {known['model/name']}"
     draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
@@ -47,6 +50,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:
             stored, bound = store(path, settings["dataset"], settings["split"], *how)
+            # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
@@ -56,7 +60,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def tables(facts: dict[str, Any]) -> list[Table]:
-    """Confidences side by side; bounds beside what came of them."""
+    """Return tables of confidences side by side, and of bounds beside what came of them."""
     wanted = {
         "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
         "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),
@@ -68,6 +72,7 @@ def tables(facts: dict[str, Any]) -> list[Table]:
     ]
     draws = []
     for how in ("random", "spatial"):
+        # Spatial draws were left out where the patches were too few.
         if f"trial/{how}/kind" not in facts:
             continue
         own = {key.rpartition("/")[2]: value for key, value in facts.items() if f"trial/{how}/" in key}

@@ -13,7 +13,6 @@ from rich.console import Console
 from gsparc.data.errors import Caution, DataError, gathered
 
 SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
-NUMBER = re.compile(r"[-+]?[.\d]+(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
 def check(
@@ -48,6 +47,7 @@ def check(
     levels = link_levels(reading.data)
     steps = [] if levels is None else steps_of(levels)
     warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
+    # Channels and spectra have conventions to be tried, powers of links have levels to be plausible.
     warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
@@ -63,6 +63,7 @@ def check(
             return False
         _line(console, f"{'drawn':<12}{draw}")
     try:
+        # The random split needs the fewest rows: where it cannot be drawn, no other one can.
         split_for({"name": "random"}, reading.data).check()
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
@@ -80,8 +81,12 @@ def _value(text: str) -> Any:
     """A setting's numbers, truth value or word."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
-    numbers = [float(one) for one in NUMBER.findall(text)]
-    return numbers if text.startswith("[") else numbers[0] if numbers else text
+    words = [one.strip() for one in text.strip("[]").split(",")] if text.startswith("[") else [text]
+    try:
+        values: list[Any] = [float(one) for one in words]
+    except ValueError:  # words as they are: a path has dots, a level may have its unit
+        values = words
+    return values if text.startswith("[") else values[0]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -52,6 +52,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
+    # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, run, bool(settings["train"]), limit_s)
         if locating:
@@ -71,6 +72,7 @@ def task(config: DictConfig) -> pd.DataFrame:
 def run(one: Prepared, left: str | None) -> None:
     """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
     config = deepcopy(one.config)
+    # What an interrupted try has left is gone on from, unless the settings name something else.
     config.ckpt_path = config.ckpt_path or left
     _, made = train(config, one.folder, begin(config, one.problem.data), in_full=False)
     for file in made.checkpoints if one.problem.draw else ():  # queries are timed with those of the first
@@ -103,6 +105,7 @@ def report(
         stem = f"{block.dataset.iloc[0]}/{block.split.iloc[0]}/{name}"
         facts[f"{stem}/first"] = block.method.iloc[0]
         for row in block.itertuples():
+            # JSON has no NaN: a method whose queries were not timed has null.
             query_ms = None if math.isnan(row.query_ms) else row.query_ms
             own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": query_ms}
             facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}

@@ -13,7 +13,7 @@ from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 
 def about(one: PublicSet) -> str:
-    """What a set is, its size and licence, how it is used and cited, and where it comes from."""
+    """Say what a set is, its size and licence, how it is used and cited, and where it comes from."""
     size = one.size if one.sources else "by hand"
     licence = one.licence or "no licence stated: ask its makers before you pass it on"
     use = f"dataset={one.dataset}" if one.dataset else "no loader of its own"
@@ -27,6 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="gsparc data", description=__doc__)
     parser.add_argument("name", nargs="*", help=f"sets to fetch, from GitHub or from the mirror {MIRROR}")
     parser.add_argument("accept", nargs="?", help="accept=true: also where the makers state no licence")
+    # argparse tells positional words by their place only: `accept=true` may stand anywhere.
     words = parser.parse_args(arguments).name
     console, failed = Console(soft_wrap=True, highlight=False), 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -34,11 +35,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for one in () if names else public_sets().values():
         console.print(about(one), markup=False)
     for name in names:
+        # One by one: what comes after a set that fails is fetched all the same.
         try:
             folder = fetch(name, accept="accept=true" in words)
             use = public_sets()[name].dataset
             console.print(f"{name}: {folder}{f', read by dataset={use}' if use else ''}", markup=False)
         except DataError as error:
+            # To stderr, so that a list piped elsewhere holds sets alone.
             Console(stderr=True, soft_wrap=True).print(f"error: {error}", markup=False, highlight=False)
             failed = 1
     return failed

@@ -41,9 +41,11 @@ def evaluate_files(
     """
     run = open_files(paths, dataset, split, others_whole=True)
     other, without = run.data.site.sha256 != run.stored[0].site.sha256, None
+    # Without the rows that the models learned from, baselines would have learned from others.
     if other and run.trained is None and (baselines is None or len(baselines)):
         baselines, without = (), "the file that the model was trained on is gone, or another"
     seconds = [one.extra.get("train_s") for one in run.stored]
+    # One fold that does not say its seconds makes the mean of all unknown.
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
     evaluation = evaluate(
         run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines,
@@ -54,7 +56,7 @@ def evaluate_files(
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Test checkpoints; return the facts written to `summary.json` in the run directory."""
     RunSettings.of(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
@@ -65,6 +67,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         eval_on=config.eval_on,
         baselines=config.baselines,
     )
+    # All folds of a run share its configuration, and so its seed.
     seed = checkpoint.read(paths[0]).configuration.get("seed")
     facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
     write_samples(run_dir / "per_sample.csv", evaluation.columns)

@@ -24,6 +24,7 @@ from gsparc.prediction.placing import in_world, with_heights
 from gsparc.prediction.predictor import Predictor
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
+# Sources of GPU kernels, of projections and of the Python module are no part of the C library.
 OTHERS = shutil.ignore_patterns("cuda", "projection", "bindings.cpp")
 LIMITS = {name: whole(1) for name in ("places", "taps", "antennas")}
 LIMITS |= {"rate_hz": or_null(POSITIVE), "to": choice("c", "taps", "deepmimo")}
@@ -36,9 +37,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     check_arguments(config, **LIMITS)
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
+    # The files of an export belong together: none is written beside those of another one.
     if out.exists():
         raise SettingError(f"out={out}: is there already; remove it or name another folder")
     predictor = load(path) if config.station is None else load(path).at(config.station)
+    # The folder appears by renaming: an export that fails leaves nothing behind.
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)
     facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
@@ -68,6 +71,7 @@ def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
 
 
 def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
+    # Taps sum tones with their phases, which rows of unknown factors do not have.
     predictor.site.need_phase("to=taps")
     place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:

@@ -32,13 +32,16 @@ BEAMS = {
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """All three experiments on one checkpoint; returns the facts of `summary.json`."""
+    """Run all three experiments on one checkpoint; return the facts of `summary.json`."""
+    # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
     RunSettings.of(config)
+    # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(int(config.seed))
     run_dir, settings = run_directory(), plain(config)
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
+    # Seconds of the experiments alone: reading the data is not theirs.
     started = time.perf_counter()
     study = LinkStudy(run, settings)
     facts = {**run.facts(), **study.facts, **study.beams()}
@@ -63,13 +66,13 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
-    """Rates, block errors and beams; what was not computed has no table."""
+    """Return tables of rates, block errors and beams; what was not computed has no table."""
     kind = facts["confidence/kind"]
     accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
     rates = [
         [
             f"{level:g}",
-            *(shown(facts.get(f"mcs/{level:.0f}dB/{key}"), form) for key, (_, form) in RATES.items()),
+            *(shown(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
         ]
         for level in levels
     ]
@@ -85,6 +88,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
         numbers = [column for modulation in modulations for column in (modulation, "behind")]
         sections.append(table(heading, ["receiver"], numbers, errors))
+    # As numbers: as text 16 comes before 4.
     antennas = sorted(
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )

@@ -28,8 +28,9 @@ class Command:
     configured: bool = True
 
     def arguments(self, words: Sequence[str]) -> list[str]:
-        """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
+        """Return a command line in Hydra's words: bare paths become `<bare>=[...]`."""
         paths = [word for word in words if self.bare and "=" not in word and not word.startswith("-")]
+        # Quoted in Hydra's grammar, as paths may hold spaces, commas and brackets.
         quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
         return [
             *(word for word in words if word not in paths),
@@ -78,13 +79,14 @@ COMMANDS = {
 
 
 def listed() -> str:
-    """All commands with one line each."""
+    """List all commands with one line each."""
     width = max(map(len, COMMANDS))
     rows = "".join(f"  {name:<{width}}  {command.answers}\n" for name, command in COMMANDS.items())
     return f"gsparc COMMAND key=value ...\n\n{rows}\n`gsparc COMMAND --help` lists a command's settings.\n"
 
 
 def nearest(name: str) -> str:
-    """`; did you mean 'train'?`, or what there is."""
+    """Return `; did you mean 'train'?`, or what there is."""
+    # Below difflib's 0.6, as names of commands are short: one letter is a large share.
     close = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(COMMANDS)}"

@@ -21,7 +21,7 @@ LIMITS = {
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Locate rows; return the facts written to `summary.json` in the run directory."""
     return locate(config, run_directory())
 
 

@@ -21,12 +21,12 @@ from gsparc.prediction.timing import peak_memory
 
 
 def settings_of(config: DictConfig) -> RunSettings:
-    """The settings of a run, of which `stations` is not one here: it holds names."""
+    """Check the settings of a run, of which `stations` is not one here: it holds names."""
     return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
 
 
 def stations_of(setting: Any) -> list[str | int] | None:
-    """Names or numbers; None for `all`.
+    """Return names or numbers; None for `all`.
 
     Raises:
         DataError: neither.
@@ -54,7 +54,11 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
-    geotiff_wanted(config.geotiff, predictor.site.georeference)
+    # Refused before evidence is gathered, which takes minutes.
+    origin = predictor.site.georeference
+    geotiff_wanted(config.geotiff, origin)
+    if config.degrees and origin is None:
+        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
     promise = promise_of(str(config.ckpt), settings)
     field = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
@@ -63,9 +67,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    origin = predictor.site.georeference
-    if config.degrees and origin is None:
-        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
     for layer in sheets if config.pictures else ():
         draw_layer(field, layer, run_dir / file_name(layer), title, floor, origin if config.degrees else None)
     if origin is not None and geotiff_wanted(config.geotiff, origin):
@@ -78,6 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     if coverage is not None and promise is not None:
         reach = promise.calibration(how.share).reach
+        # NaN alone differs from itself: figures that these rows do not tell are left out.
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s)"

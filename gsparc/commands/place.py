@@ -38,6 +38,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
     promise, error = promise_of(path, settings), NewStation()
+    # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
         error = new_station_error(trained(path, settings["dataset"]), int(config.left_out))
     placing = place_next(predictor, count=config.count, promise=promise, error=error, **query)
@@ -46,6 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
     draw_placing(placing, run_dir / "place.png", level, unit)
+    # Candidates come best first.
     x, y, z = placing.places[0]
     where = f"({x:.2f}, {y:.2f}, {z:.2f})"
     if predictor.site.georeference is not None:

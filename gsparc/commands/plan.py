@@ -23,6 +23,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     settings_of(config)
     run_dir, settings = run_directory(), plain(config)
     floor = plan_of(settings)
+    # Before anything is measured there is no model, and places are spread over the area.
     predictor = None if config.ckpt is None else load(config.ckpt)
     promise = None if predictor is None else promise_of(str(config.ckpt), settings)
     plan = plan_next(
@@ -32,6 +33,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
+    # Rows are in the order of the walk; the rank is that of their gains.
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_plan_picture(plan, run_dir / "plan.png", promise, predictor, floor)

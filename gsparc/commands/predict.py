@@ -13,7 +13,7 @@ from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
     RunSettings.of(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
@@ -22,6 +22,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
+    # Powers alone have a lowest and a highest.
     ends = [value for name, value in facts.items() if name.startswith(("predict/lowest", "predict/highest"))]
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"

@@ -18,11 +18,12 @@ from gsparc.evaluation.summary import program, provenance, write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    """Write one page about runs; return the facts written to `summary.json` in the run directory."""
     if OmegaConf.is_missing(config, "runs"):
         raise ValueError("no run is named; say gsparc report RUN..., folders of runs or of whole sweeps")
     paths = [Path(path) for path in config.runs]
     runs = find_runs(paths)
+    # Times of other days and machines do not compare: every model is asked anew, here.
     if config.retime:
         runs = retime(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
     out = run_directory()
@@ -47,6 +48,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
     """Swept fronts in and below the directories, with the names of their datasets."""
+    # Sorted, as the order of a file system differs from machine to machine.
     files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
     texts = ((file.parent / "summary.json").read_text(encoding="utf-8") for file in files)
     return [(str(json.loads(t)["dataset/name"]), columns(f)) for t, f in zip(texts, files, strict=True)]

@@ -22,7 +22,7 @@ OTHERS = 64  # files that are open beside connections: the log, libraries
 
 
 def loopback(host: str) -> bool:
-    """Whether nobody else reaches it."""
+    """Tell whether a host is this machine itself, which nobody else reaches."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -34,6 +34,7 @@ def task(config: DictConfig) -> None:
     RunSettings.of(config)
     whole(0, 65535).check("port", config.port)
     token = config.token or os.environ.get("GSPARC_TOKEN")
+    # Without a token only this machine's own users may be answered.
     if not token and not loopback(config.host):
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
@@ -47,6 +48,7 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt, unit=config.unit)
     predictor = predictor if config.station is None else predictor.at(config.station)
+    # Powers of all stations are one answer; channels and spectra are of one station each.
     if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
     app = application(predictor, limits, token)

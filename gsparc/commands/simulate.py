@@ -30,7 +30,7 @@ OTHERS = "ours: conference_room, shoebox; your own: osm (scene.file=TOWN.osm), x
 
 
 def campaign(config: DictConfig) -> Campaign:
-    """The campaign that a composed configuration describes.
+    """Return the campaign that a composed configuration describes.
 
     Raises:
         ValueError: a setting that does not exist or cannot be.
@@ -45,6 +45,7 @@ def campaign(config: DictConfig) -> Campaign:
 
 
 def _effects(config: dict[str, Any]) -> PropagationEffects | AutoSettings:
+    # Effects that are to be chosen among stand under `full`; without it they are given.
     if "full" not in config:
         return effects_from_config(config)
     return AutoSettings(**{**config, "full": effects_from_config(config["full"])})
@@ -67,11 +68,13 @@ def task(config: DictConfig) -> Outcome | None:
         return None
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
+    # The folder of parts is locked: a second run of the same file would add its shards to it.
     with locked(out.with_name(out.name + ".parts"), "out"):
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     simulated.floor_plan(outcome, run_dir / "floor_plan.png")
     triangles = outcome.survey.engine.triangles()
+    # The exact shoebox has walls, but no triangles.
     if len(triangles):
         write_mesh(triangles, run_dir / "scene.obj")
     if outcome.choice is not None:

@@ -30,7 +30,7 @@ from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
 def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
-    """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
+    """Return those of `config.variants`, overrides of `config.model`, then `config.baselines` by name."""
 
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
     variants = {
@@ -41,7 +41,7 @@ def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
 
 
 def study_of(config: DictConfig) -> Study:
-    """The study that a composed configuration describes."""
+    """Return the study that a composed configuration describes."""
     return Study(
         variants_of(config),
         instantiate(config.kind).conditions(),
@@ -61,6 +61,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
     try:
+        # Rounds that were done on other data, splits or settings do not count as these.
         state = State.of(config, content(data), split.sha256)
         rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training
@@ -81,7 +82,7 @@ def task(config: DictConfig) -> pd.DataFrame:
 
 
 def table_of(rows: pd.DataFrame, title: str) -> Table:
-    """A line per row; conditions and ratios where the study has any."""
+    """Return a table with a line per row; conditions and ratios where the study has any."""
     changed, compared = (rows.what != "none").any(), rows.train_ratio.notna().any()
     heads = {"train_s": "train s", "train_ratio": "ratio", "train_cpu_s": "cpu s", "query_ms": "query ms",
              "query_p95_ms": "p95", "query_ratio": "ratio"}  # fmt: skip

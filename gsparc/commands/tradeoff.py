@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """What the command does; returns the facts of `summary.json`; a job of a multirun is done once."""
+    """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     state = State.of(config, content(run.data), run.split.sha256)
@@ -49,6 +49,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     """Measure, draw and write."""
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
     rows = rows_of(fold, config.eval_on)
+    # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = contributions(method, data, learned)
     settings = list(combinations(method, plain(config.grid), plain(config.singles)))
@@ -57,13 +58,15 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, reduced(method, some, measured)) for some in settings]
     others = tradeoff.others_of(run, config.baselines, config.peers, config.ckpt, config.eval_on)
-    places = data.moving[rows] + data.site.origin
+    # Predictors are asked in world coordinates, as a user would.
+    places = data.moving[rows]
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.scored]
     pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         operating_point.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
@@ -91,6 +94,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         tracking.table(loggers, "operating points", heads, lines)
     sentences = [*tradeoff.irreducible(method), *tradeoff.slope(facts)]
     finish(run_dir, facts, table(title, ["not beaten"], heads[1:], lines), lines=sentences)
+    # A front of one model's points alone would hide that another method is as fast and better.
     for p in best:
         other = tradeoff.beaten_by(p, beside, figure)
         if other is not None:
@@ -98,6 +102,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
 
 
 def _threads(setting: Sequence[int] | None) -> list[int]:
+    # Small queries are mostly fastest on one thread, large batches on all.
     counts = sorted({1, torch.get_num_threads()}) if setting is None else sorted({int(n) for n in setting})
     for count in counts or [0]:  # at most the cores of this machine
         whole(1, os.cpu_count()).check("threads", count)

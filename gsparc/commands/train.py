@@ -151,6 +151,7 @@ def train(
                 # the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(method, data, split, contexts, keep=keep)
+                # Some options are read by answers alone: one query, before unused options are listed.
                 fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
 
             unused = options.unheeded(reads, fits.methods[0], data)
@@ -207,6 +208,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
         return [path] * folds
     run = fitting.folder_of(path, fitting.FOLDS)
     every = [run / f"fold{number}" for number in range(folds)]
+    # A file that belongs to no fold says nothing of where the other folds stand.
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
         raise ValueError(
             f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
@@ -257,6 +259,7 @@ def _of_folds(
     contexts = in_folders(whole, split) if len(resumes) > 1 else [whole]
     contexts = [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
     if whole.budget_s is not None:
+        # Reading is charged to the first fold: the others find the data read.
         left_s = max(whole.budget_s - read_s, LEAST_SHARE * whole.budget_s)
         contexts[0] = replace(contexts[0], budget_s=left_s)
     return contexts
@@ -328,7 +331,7 @@ def _draw(
 
 
 def objective_of(config: DictConfig, kind: Scored) -> str:
-    """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
+    """Return the figure of rows `eval_on` that a search improves; `objective: null`: the deciding one.
 
     Raises:
         ValueError: there is no such figure.
@@ -366,6 +369,7 @@ def task(config: DictConfig) -> float:
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:
         return score_of(figure, value)
+    # A search cannot rank a job without its figure; a plain multirun can do without.
     if job and hydra.runtime.choices["hydra/sweeper"] != "basic":
         raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")
     return math.nan  # only a search asks for it

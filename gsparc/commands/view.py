@@ -35,6 +35,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
     RunSettings.of(config)
     save = None if config.save is None else Path(str(config.save))
+    # Before model and data are read, which takes seconds.
     check(save, int(config.port))
     view = view_of(plain(config))
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
@@ -51,13 +52,14 @@ def check(save: Path | None, port: int) -> None:
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
     whole(0, 65535).check("port", port)
+    # Pages are made of viser's client; pictures and splat files are not.
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
         without = "(save=picture.png and save=gaussians.ply do without)"
         raise DataError(f"viewing in a browser needs viser: pip install 'gsparc[viewer]' {without}")
 
 
 def view_of(settings: dict[str, Any]) -> SiteView:
-    """Everything that is shown, from a configuration; `DataError` for a file or a place that cannot be."""
+    """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
     plan, walls = plan_of(settings), settings["walls"]
     building = Building(plan, None if walls is None else read_walls(walls))
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
@@ -70,7 +72,8 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 
 
 def serve(view: SiteView, host: str, port: int) -> str:
-    """Until Ctrl-C; returns what is said then."""
+    """Serve until Ctrl-C; return what is said then."""
+    # Imported here, as viser is an extra that pictures do without.
     from gsparc.apps.view.server.serve import Server
 
     server = Server(view, host, port)
@@ -80,7 +83,7 @@ def serve(view: SiteView, host: str, port: int) -> str:
 
 
 def write(view: SiteView, path: Path) -> str:
-    """A page, a picture or a splat file, whole or not at all; returns what is said then."""
+    """Write a page, a picture or a splat file, whole or not at all; return what is said then."""
     ending = path.suffix.lower()
     if ending == ".png":
         draw_still(view, path)

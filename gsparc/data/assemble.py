@@ -18,7 +18,7 @@ FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a posi
 
 
 def bad_positions(position: np.ndarray) -> np.ndarray:
-    """Rows (n,) of `position` (S, 3) [m] that no place on Earth could have."""
+    """Return rows (n,) of `position` (S, 3) [m] that no place on Earth could have."""
     with np.errstate(invalid="ignore"):
         good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
     return np.flatnonzero(~good)
@@ -36,7 +36,7 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
 
 
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
+    """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
 
     This is a constant of the site, taken over all rows but those that are `too_strong` for the others:
     rounding keeps any single row (which may be a test row) from influencing it. `weight` is a bool mask of
@@ -58,7 +58,7 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
 
 
 def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
-    """SHA-256 of named arrays: type, shape and bytes; the same whatever file they came from."""
+    """Return the SHA-256 of named arrays (type, shape, bytes), the same whatever file they came from."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = arrays[name]
@@ -72,7 +72,7 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
 
 
 def identity(data: Measurements) -> str:
-    """SHA-256 of all that a method learns from, for the names of kept results.
+    """Return the SHA-256 of all that a method learns from, for the names of kept results.
 
     The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in another unit
     or about another origin they are other data.
@@ -112,7 +112,7 @@ def assemble(
     position_std: np.ndarray | None = None,
     **facts: Any,
 ) -> Measurements:
-    """Measurements centred on the scene box, from validated world coordinates.
+    """Centre measurements on the scene box, from validated world coordinates.
 
     Args:
         static_end, array, carrier_hz, subcarriers_hz, **facts: see `Site`.

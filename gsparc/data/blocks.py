@@ -18,7 +18,7 @@ MEMORY = 2.0**32  # bytes of a machine that does not say it
 
 
 def memory() -> float:
-    """Of the machine [bytes]."""
+    """Return the memory of the machine [bytes]."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -26,19 +26,19 @@ def memory() -> float:
 
 
 def is_big(array: Any) -> bool:
-    """Whether an array, or a dataset of a file, is to stay on disk."""
+    """Tell whether an array, or a dataset of a file, is to stay on disk."""
     return array.size * array.dtype.itemsize >= BIG
 
 
 def blocks(array: Any) -> Iterator[slice]:
-    """Rows of about `BLOCK` bytes, in their order; at least one block."""
+    """Yield rows of about `BLOCK` bytes, in their order; at least one block."""
     each = array.size * array.dtype.itemsize // max(len(array), 1)
     step = max(1, BLOCK // max(each, 1))
     yield from (slice(start, start + step) for start in range(0, max(len(array), 1), step))
 
 
 def contents(array: np.ndarray) -> Iterator[bytes]:
-    """Bytes of an array in the order of its entries, a block at a time."""
+    """Yield bytes of an array in the order of its entries, a block at a time."""
     if not array.ndim:
         yield array.tobytes()
         return
@@ -57,7 +57,7 @@ class OnDisk(np.memmap):
 
     @classmethod
     def of(cls, file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0) -> OnDisk:
-        """What lies in an open file from `offset` on [bytes]."""
+        """Return what lies in an open file from `offset` on [bytes]."""
         array = cls(file, dtype, mode, offset, shape)
         array.file = file
         return array
@@ -75,7 +75,7 @@ def _opened(handle: Any, dtype: Any, shape: tuple[int, ...], offset: int) -> OnD
 
 
 def scratch(shape: tuple[int, ...], dtype: Any) -> OnDisk:
-    """An array of zeros in a file without a name (in TMPDIR), which is gone when the array is.
+    """Return zeros in a file without a name (in TMPDIR), which is gone when the array is.
 
     Raises:
         OSError: no room.
@@ -88,7 +88,7 @@ def scratch(shape: tuple[int, ...], dtype: Any) -> OnDisk:
 
 
 def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array to be filled, on disk where it is large.
+    """Return an array to be filled, on disk where it is large.
 
     Raises:
         OSError: no room.
@@ -98,7 +98,7 @@ def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows (n,) of an array, on disk where they are many and lie there already."""
+    """Return rows (n,) of an array, on disk where they are many and lie there already."""
     if not isinstance(array, np.memmap) or len(rows) * array[:1].nbytes < BIG:
         return array[rows]
     copy = scratch((len(rows), *array.shape[1:]), array.dtype)
@@ -108,7 +108,7 @@ def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def on_disk(dataset: h5py.Dataset) -> OnDisk:
-    """A dataset's values where they are, or, stored in chunks, copied beside them block by block."""
+    """Return a dataset's values where they are, or, stored in chunks, copied beside them by blocks."""
     offset = dataset.id.get_offset()
     if offset is not None and dataset.dtype.isnative:
         file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)
@@ -120,5 +120,5 @@ def on_disk(dataset: h5py.Dataset) -> OnDisk:
 
 
 def evenly(count: int, most: int) -> np.ndarray:
-    """Numbers (n,) int64 of at most `most` of `count` things in order, evenly spread from first to last."""
+    """Return (n,) int64, at most `most` of `count` numbers in order, evenly from first to last."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)

@@ -44,19 +44,19 @@ class Signals:
 
     @classmethod
     def of(cls, data: Measurements) -> Self:
-        """Those of measurements that are no powers."""
+        """Take the signals of measurements that are no powers."""
         site, tones = data.site, None if data.site.kind == "spectrum" else data.site.tones()
         array = None if site.array is None or len(site.array) != data.target.shape[1] else site.array
         ends = data.tx, data.rx_position, data.rx_rotation
         return cls(data.target, data.mask, *ends, tones, None if tones is None else array, site.grid)
 
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Signals:
-        """The same with entries of values and mask elsewhere."""
+        """Return the same with entries of values and mask elsewhere."""
         mask = None if self.mask is None else change(self.mask)
         return replace(self, values=change(self.values), mask=mask)
 
     def rows(self, part: slice | np.ndarray) -> Signals:
-        """Some of the rows."""
+        """Return some of the rows."""
         of_rows = ("values", "mask", "tx", "rx", "rotation")
         whole = {name: getattr(self, name) for name in of_rows}
         parts: dict[str, Any] = {name: None if one is None else one[part] for name, one in whole.items()}
@@ -116,11 +116,13 @@ def _grid(first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0) 
 def _with_delays(signals: Signals) -> Signals:
     assert signals.tones is not None
     distance = np.linalg.norm(signals.tx - signals.rx, axis=1)
+    # About the mean of the tones, so that phases there stay.
     turns = (signals.tones - signals.tones.mean()) * distance[:, None] / LIGHT
     return replace(signals, values=signals.values * np.exp(-2j * np.pi * turns)[:, None])
 
 
 def _without_zeros(signals: Signals) -> Signals:
+    # A tone that is 0 in all rows and antennas was not measured, like guard tones of OFDM.
     measured = np.broadcast_to((signals.values != 0).any(axis=(0, 1)), signals.values.shape)
     return replace(signals, mask=measured if signals.mask is None else measured & signals.mask)
 
@@ -130,18 +132,22 @@ def _along(signals: Signals) -> int:
     if not _antennas(signals):
         return 0
     place = np.asarray(signals.array)
+    # Rounded to 1e-4 of the array's side: files print positions of a lattice with few digits.
     cells = np.round((place - place[0]) / max(float(np.ptp(place, axis=0).max()), 1e-9), 4)
     sides = [len(np.unique(cells[:, axis])) for axis in range(3)]
+    # A full lattice in a plane: one coordinate is constant, and the sides' product is the count.
     planar = sorted(sides)[0] == 1 and sorted(sides)[1] > 1 and math.prod(sides) == len(place)
     return sides[int(np.abs(cells[1]).argmax())] if planar else 0
 
 
 def _other_axis_first(signals: Signals) -> Signals:
+    # The list runs along the other axis than the positions do; these stay as they are.
     order = np.arange(signals.values.shape[1]).reshape(_along(signals), -1).T.ravel()
     return signals.moved(lambda values: values[:, order])
 
 
 def _transposed(signals: Signals) -> Signals:
+    # Only images without `grid_deg` come here (`_hemisphere`): the grid follows from their shape.
     grid = SphereGrid.hemisphere(*signals.values.shape[:0:-1])
     return replace(signals.moved(lambda values: values.swapaxes(1, 2)), grid=grid)
 
@@ -153,6 +159,7 @@ def _last(grid: SphereGrid) -> tuple[float, float]:
 
 
 def _from_zenith(grid: SphereGrid) -> tuple[float, float]:
+    # Angles from the zenith run downwards: rows are reversed, and begin where the last one was.
     return math.pi / 2 - _last(grid)[0], grid.first_azimuth
 
 
@@ -197,6 +204,7 @@ def _planar(signals: Signals) -> bool:
 UNTRIED = ("swap_iq", "zeros_unmeasured", "decibels")  # as conjugate, or told by other means
 _ROWS: dict[str, tuple[str, Callable[[Signals], Signals], Callable[[Signals], bool]]] = {
     "conjugate": ("conjugated channels, exp(+j 2 pi f d / c)", _values(np.conj), _channel),
+    # I and Q exchanged are a conjugate turned by a quarter: Q + jI = j conj(I + jQ).
     "swap_iq": ("I and Q swapped", _values(lambda v: 1j * v.conj()), _channel),
     "exchange_axes": ("axes of antennas and tones exchanged", _moved(lambda v: v.swapaxes(1, 2)), _square),
     "fft_order": ("tones in the order of an FFT", _moved(lambda v: np.fft.fftshift(v, axes=2)), _tones),
@@ -218,7 +226,7 @@ CONVENTIONS = {name: Convention(*row, name not in UNTRIED) for name, row in _ROW
 
 
 def mended(signals: Signals, names: Iterable[str]) -> Signals:
-    """Signals of the schema's conventions, from those of a file that follows the ones named.
+    """Return signals in the schema's conventions, from those of a file that follows the ones named.
 
     Raises:
         DataError: no such convention, or one that cannot be of these measurements.
@@ -227,6 +235,7 @@ def mended(signals: Signals, names: Iterable[str]) -> Signals:
     for name in chosen - set(CONVENTIONS):
         hint = nearest(name, CONVENTIONS, 0.4)
         raise DataError(f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{hint}")
+    # In the table's order, not the user's: axes are exchanged before what runs along them is turned.
     for name in [name for name in CONVENTIONS if name in chosen]:
         one = CONVENTIONS[name]
         if not one.applies(signals):
@@ -238,6 +247,7 @@ def mended(signals: Signals, names: Iterable[str]) -> Signals:
 
 def _in_blocks(signals: Signals, change: Callable[[Signals], Signals]) -> Signals:
     """The same block by block, with values on disk."""
+    # One row tells the shape, dtype, array and grid that the change leads to.
     first = change(signals.rows(slice(0, 1)))
     values = scratch((len(signals.values), *first.values.shape[1:]), first.values.dtype)
     masks = []

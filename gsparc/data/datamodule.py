@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 
 def steps_per_epoch(pool_size: int, batch_size: int) -> int:
-    """Batches that show every row of the pool once; the last may be smaller."""
+    """Count the batches that show every row of the pool once; the last may be smaller."""
     return -(-pool_size // batch_size)
 
 
 def order(seed: int, step: int, batch_size: int, pool: np.ndarray) -> np.ndarray:
-    """Rows (b,) of training step `step` (from 0): a slice of the permutation seeded by (seed, epoch).
+    """Return rows (b,) of step `step` (from 0): a slice of the permutation seeded by (seed, epoch).
 
     Args:
         seed: of the run.
@@ -48,7 +48,7 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
 
 
 def share(rows: np.ndarray, rank: int, devices: int) -> np.ndarray:
-    """The rows of a batch that device `rank` takes: every `devices`-th, at least one: all take the step."""
+    """Return rows of a batch for device `rank`, every `devices`-th, at least one: all take the step."""
     mine = rows[rank::devices]
     return mine if len(mine) else rows[rank % len(rows) :][:1]
 
@@ -89,15 +89,16 @@ class StepLoader:
         for step in range(start, (start // len(self) + 1) * len(self)):
             rows = order(self.seed, step, self.batch_size, self.pool)
             mine = share(rows, self.rank, self.devices)
+            # A device without a row of its own repeats one, so that it joins the step, with weight 0.
             part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
             yield replace(self.data.batch(mine), share=part)
 
     def state_dict(self) -> dict[str, int]:
-        """Nothing to store: the order is a pure function of (seed, step). Marks the loader as resumable."""
+        """Store nothing: the order is a pure function of (seed, step). Marks the loader as resumable."""
         return {}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Nothing to restore."""
+        """Restore nothing."""
 
 
 class RowsLoader:
@@ -162,26 +163,26 @@ class DataModule(pl.LightningDataModule, ABC):
         self.measurements  # noqa: B018 (reading is what is wanted)
 
     def train_dataloader(self) -> StepLoader:
-        """Training batches, starting where the trainer stands (also in the middle of an epoch)."""
+        """Return training batches, starting where the trainer stands (also in the middle of an epoch)."""
         trainer = self.trainer
         rank, devices = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         how = self._rows().train, self.batch_size, self.seed, self._batches_shown, rank, devices
         return StepLoader(self.measurements, *how)
 
     def val_dataloader(self) -> RowsLoader:
-        """Validation rows in order, all of them on every device."""
+        """Return validation rows in order, all of them on every device."""
         return RowsLoader(self.measurements, self._rows().val, self.batch_size)
 
     def test_dataloader(self) -> RowsLoader:
-        """Test rows in order, all of them on every device."""
+        """Return test rows in order, all of them on every device."""
         return RowsLoader(self.measurements, self._rows().test, self.batch_size)
 
     def predict_dataloader(self) -> RowsLoader:
-        """The test rows."""
+        """Return the test rows."""
         return self.test_dataloader()
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """The batch on `device`; a Batch is a frozen dataclass, which Lightning does not move itself."""
+        """Move the batch, a frozen dataclass, which Lightning does not move itself."""
         return batch.to(device)
 
     def _rows(self) -> Fold:
@@ -190,6 +191,7 @@ class DataModule(pl.LightningDataModule, ABC):
         return self.fold
 
     def _batches_shown(self) -> int:
+        # Without a trainer, as in a notebook, batches begin with the first one.
         if self.trainer is None:
             return 0
         # `completed` is what a checkpoint restores; `ready` would count the batch a kill interrupted.
@@ -206,8 +208,9 @@ class Loaded(DataModule):
 
     def __init__(self, measurements: Measurements, batch_size: int = 16) -> None:
         super().__init__(measurements.site.name, batch_size)
+        # Takes the place of the cached property: nothing is read.
         self.measurements = measurements
 
     def load(self) -> Measurements:
-        """What it was given."""
+        """Return what it was given."""
         return self.measurements

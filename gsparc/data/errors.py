@@ -15,12 +15,12 @@ MOST = 300  # characters of a message: what was found may be a whole file in one
 
 
 def shortened(text: str) -> str:
-    """A text without its middle when it is long."""
+    """Return a text without its middle when it is long."""
     return text if len(text) <= MOST else f"{text[: MOST // 2]} ... {text[-MOST // 3 :]}"
 
 
 def some(names: Sequence[Any], count: int = 5) -> str:
-    """The first of several names, and how many more there are."""
+    """Return the first of several names, and how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return ", ".join(map(str, names[:count])) + more
 
@@ -31,12 +31,12 @@ NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|\S*[/\d]\S*|[^a-z ]"
 
 
 def kind_of(warning: str) -> str:
-    """What warnings of one kind share: their first words, without names and numbers."""
+    """Return what warnings of one kind share: their first words, without names and numbers."""
     return " ".join(re.sub(NAMES, " ", warning).split())[:30]
 
 
 def gathered(warnings: Sequence[str]) -> list[str]:
-    """Warnings of which more than a few of one kind are one, counted."""
+    """Return warnings, more than a few of one kind counted as one."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for text in warnings:
         kinds[kind_of(text)].append(text)
@@ -48,7 +48,7 @@ def gathered(warnings: Sequence[str]) -> list[str]:
 
 
 def lines_of(rows: Sequence[str], count: int = 5) -> str:
-    """The names of rows (`line 2`, `row 7`), neighbours as `lines 2 to 20`, at most `count` pieces."""
+    """Name rows (`line 2`, `row 7`), neighbours as `lines 2 to 20`, in at most `count` pieces."""
     numbers = [int(last) if (last := name.rpartition(" ")[2]).isdigit() else -9 for name in rows]
     starts = [i for i in range(len(rows)) if i == 0 or numbers[i] != numbers[i - 1] + 1 or numbers[i] < 0]
     pieces = []
@@ -60,13 +60,13 @@ def lines_of(rows: Sequence[str], count: int = 5) -> str:
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """`; did you mean 'gp'?`, or nothing when no known name is close."""
+    """Return `; did you mean 'gp'?`, or nothing when no known name is close."""
     close = difflib.get_close_matches(name, known, 1, cutoff)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def reason(error: BaseException) -> str:
-    """What another library says is wrong, on one line, without what only a programmer could do about it."""
+    """Say what another library calls wrong, on one line, without what only a programmer could do about it."""
     if isinstance(error, RecursionError):
         return "brackets within brackets, too many"
     text = " ".join(str(error).split()).partition("; use sys.set_int_max_str_digits")[0]
@@ -117,7 +117,7 @@ class Problems(list[str]):
             self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
 
     def attempt(self, read: Callable[[], _Found]) -> _Found | None:
-        """What `read` returns; None, and noted, where it raises `DataError`."""
+        """Return what `read` does; None, and noted, where it raises `DataError`."""
         try:
             return read()
         except DataError as error:

@@ -68,7 +68,7 @@ def use(engine: Engine) -> None:
 
 
 def elsewhere() -> bool:
-    """Whether pieces are done in other processes."""
+    """Tell whether pieces are done in other processes."""
     return _chosen.engine != "process"
 
 
@@ -81,7 +81,7 @@ def each(
     wanted: Callable[[_Piece], bool] = lambda piece: True,
     threads: int = 1,
 ) -> Iterator[tuple[int, _Result]]:
-    """Numbers of pieces and what `work` makes of them, as they end; in order in this process.
+    """Yield numbers of pieces and what `work` makes of them, as they end; in order in this process.
 
     Work and pieces are pickled for other processes, work once for each; these have the threads of this one.
 

@@ -27,13 +27,13 @@ LEAST_NODES = 10_000  # of YAML that are not counted
 
 
 def platform_cache() -> Path:
-    """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
+    """Return where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
 
 
 def is_address(path: object) -> bool:
-    """Whether a file is named by a URL, which reading asks somebody for."""
+    """Tell whether a file is named by a URL, which reading asks somebody for."""
     return "://" in str(path)
 
 
@@ -51,7 +51,7 @@ class Several(str):
 
 
 def read_text(path: Path, missing: str, kind: str = "text") -> str:
-    """A text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
+    """Read a text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -61,7 +61,7 @@ def read_text(path: Path, missing: str, kind: str = "text") -> str:
 
 
 def read_csv(path: Path, missing: str) -> list[list[str]]:
-    """Cells of each line, between commas; `DataError` as of `read_text`."""
+    """Read cells of each line, between commas; `DataError` as of `read_text`."""
     text = read_text(path, missing, "CSV text")
     try:
         return list(csv.reader(map(partial(checked_line, path), count(1), io.StringIO(text))))
@@ -70,13 +70,13 @@ def read_csv(path: Path, missing: str) -> list[list[str]]:
 
 
 def shipped(package: str, name: str) -> list[dict[str, str]]:
-    """Rows of a table in CSV that a package brings, by its heads."""
+    """Read rows of a table in CSV that a package brings, by its heads."""
     text = files(package).joinpath(name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))
 
 
 def checked_line(path: str | Path, number: int, line: str) -> str:
-    """The line of a table; DataError where it is longer than `LONGEST_LINE`."""
+    """Return the line of a table; DataError where it is longer than `LONGEST_LINE`."""
     if len(line) > LONGEST_LINE:
         fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
         raise DataError(f"{path}, line {number}: {fault}")
@@ -84,7 +84,7 @@ def checked_line(path: str | Path, number: int, line: str) -> str:
 
 
 def load_yaml(text: str, source: str | Path) -> Any:
-    """What a text in YAML holds.
+    """Read what a text in YAML holds.
 
     Raises:
         DataError: aliases that repeat without end, or nearly.
@@ -110,7 +110,7 @@ def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
 
 
 def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
-    """A table in YAML.
+    """Read a table in YAML.
 
     Args:
         path: of the file.
@@ -140,7 +140,7 @@ def check_yaml(folder: str | None) -> None:
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """A path beside `path` to write a file to; its folder is made.
+    """Open a path beside `path` to write a file to; its folder is made.
 
     When the block ends the file is on the disk and takes the place of `path`. A block that fails leaves what
     was there, and nothing else.
@@ -159,12 +159,13 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
-    """An empty folder beside `path`, which must not exist; it becomes `path` when the block ends.
+    """Open an empty folder beside `path`, which must not exist, and which it becomes when the block ends.
 
     For contents that are a function of the name: where another process made `path` meanwhile, that one stays.
     """
     path = Path(path)
     partial = _partial(path)
+    shutil.rmtree(partial, ignore_errors=True)  # of a killed process, whose number this one has again
     partial.mkdir(parents=True)
     try:
         yield partial
@@ -178,7 +179,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
 
 def no_room(error: BaseException | None) -> bool:
-    """Whether a full disk, quota or limit is what an error, or what it was made of, says."""
+    """Tell whether a full disk, quota or limit is behind an error, or behind what caused it."""
     while error is not None and not isinstance(error, OSError):
         error = error.__cause__ or error.__context__
     return error is not None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)

@@ -49,7 +49,7 @@ class Reads:
     noted: set[str] = field(default_factory=set)
 
     def heeds(self, path: str) -> bool:
-        """Whether a setting, or a group that was chosen, was read."""
+        """Tell whether a setting, or a group that was chosen, was read."""
         within = path not in {option.path for option in self.options}
         groups = [path.rsplit(".", count)[0] for count in range(1, path.count(".") + 1)] if within else []
         return not self.noted.isdisjoint({"*", path, *groups})
@@ -105,13 +105,13 @@ def apart() -> Iterator[set[str]]:
 
 
 def count(*paths: str) -> None:
-    """These were heeded, as in `Reads.noted`."""
+    """Count these as heeded, as in `Reads.noted`."""
     if _reads is not None:
         _reads.noted.update(paths)
 
 
 def carried(work: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, set[str]]]:
-    """Work for other processes, with what is read there; see `brought`."""
+    """Return work for other processes, with what is read there; see `brought`."""
     options = () if _reads is None else _reads.options
 
     def there(piece: Any) -> tuple[Any, set[str]]:
@@ -122,6 +122,6 @@ def carried(work: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, set[str]]]
 
 
 def brought(result: tuple[Any, set[str]]) -> Any:
-    """The result of work that was `carried`."""
+    """Return the result of work that was `carried`."""
     count(*result[1])
     return result[0]

@@ -99,7 +99,7 @@ def inner_folds(
 
 
 def cut_inside(data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int) -> InnerFolds:
-    """`inner_folds` of measurements.
+    """Return `inner_folds` of measurements.
 
     Where both ends are taken for moving only because stations are learned together, what moves is the other
     end than theirs, as it was for the split.

@@ -16,13 +16,13 @@ _Kind = TypeVar("_Kind")
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """`; did you mean 'gp'?`, or what there is when nothing is close."""
+    """Return `; did you mean 'gp'?`, or what there is when nothing is close."""
     known = list(known)
     return nearest(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
 def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting") -> _Kind:
-    """The dataclass `kind` with the values of a config group.
+    """Build the dataclass `kind` with the values of a config group.
 
     Raises:
         DataError: a key that is no field (a `noun`), or, a `SettingError`, a value that cannot be.
@@ -38,7 +38,7 @@ def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun
 
 
 def targets(node: Any) -> Iterator[Any]:
-    """Every `_target_` in a config (plain containers), at any depth."""
+    """Yield every `_target_` in a config (plain containers), at any depth."""
     if isinstance(node, dict):
         for key, value in node.items():
             if key == "_target_":
@@ -51,7 +51,7 @@ def targets(node: Any) -> Iterator[Any]:
 
 
 def find(path: str) -> Any:
-    """What an import path names; None when there is no such thing."""
+    """Return what an import path names; None when there is no such thing."""
     module, _, attribute = path.rpartition(".")
     try:
         return getattr(import_module(module), attribute, None) if module else None
@@ -80,12 +80,12 @@ PLAIN = (bool, int, float, str, list, dict, type(None))
 
 
 def plugins(group: str) -> dict[str, str]:
-    """Import path `module.Class` of every plugin for a config group (`model` or `dataset`), by its name."""
+    """Return the import path `module.Class` of every plugin of a config group, `model` or `dataset`."""
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=GROUPS[group])}
 
 
 def node_of(kind: type) -> dict[str, Any]:
-    """The node of a configuration that builds a class: what it takes with defaults; `???` without one.
+    """Return the configuration that builds a class: what it takes with defaults; `???` without one.
 
     Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
@@ -97,7 +97,7 @@ _OTHER = object()
 
 
 def arguments(kind: type) -> dict[str, Any]:
-    """What a class takes, with defaults; `**names` stands for what its base class, or `hands_on`, takes."""
+    """Return what a class takes, with defaults; `**names` is what its base class, or `hands_on`, takes."""
     if kind is object:
         return {}
     own = list(inspect.signature(kind.__init__).parameters.values())[1:]  # type: ignore[misc]

@@ -31,7 +31,7 @@ PATHS = {"file": "root", "root": "file"}
 
 
 def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule:
-    """The data module that a config of the group `dataset` describes; nothing is read yet.
+    """Build the data module that a config of the group `dataset` describes; nothing is read yet.
 
     Args:
         config: `_target_` and its arguments; without `_target_`, what conf/dataset holds under
@@ -77,7 +77,7 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
 
 
 def load(config: Mapping[str, Any]) -> Measurements:
-    """The measurements of `datamodule(config)`.
+    """Read the measurements of `datamodule(config)`.
 
     Raises:
         DataError: as `datamodule`, missing file, or bad input.
@@ -108,7 +108,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
-    """What the config group `split` says.
+    """Return what the config group `split` says.
 
     Raises:
         DataError: unknown name or key, or impossible shares.

@@ -59,7 +59,7 @@ def load_own(path: str | Path) -> Measurements:
 
 
 def interpreted(raw: Raw, source: str | Path) -> Measurements:
-    """The measurements of `interpret`; notes are logged."""
+    """Return the measurements of `interpret`; notes are logged."""
     reading = interpret(raw, source)
     for note in reading.notes:
         log.warning("%s: %s", source, note)
@@ -86,7 +86,7 @@ def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | 
 
 
 def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> Measurements:
-    """The same without a file.
+    """Validate arrays as `write_own` does, without a file.
 
     Raises:
         DataError: what `load_own` would refuse.
@@ -110,15 +110,18 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     measured = check.measurement()
     about = _attributes(check, Path(source).stem, measured)
     links = None if measured is None else expand(check, measured)
+    # Without a measurement no array has a length to be checked against: nothing more can be said.
     if measured is None or links is None:
         check.problems.raise_if_any()
     assert measured is not None and links is not None
     raw = check.raw
+    # Only places that the file leaves open may be NaN; `check.position` refuses all others.
     lost = links.stations is not None and np.isnan(links.stations.position).any()
     lost |= links.unknown_transmitter
     check.unknown = f"{links.static_end}_position" if lost else None
     values, kind = _measured(check, measured)
     if values is None:
+        # Positions are checked all the same, so that one message lists everything that is wrong.
         for name in ("rx_position", "tx_position"):
             check.position(name, None)
         check.problems.raise_if_any()
@@ -132,10 +135,12 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     named = str(raw.attributes.get("conventions", "")).split()
+    # Transposed images: their grid is that of the axes as they will be.
     height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
     grid = check.grid(height, width) if kind == "spectrum" else None
     array = _array(check, values.shape[1] if kind == "csi" else None)
     noise = _not_negative(check, "noise_variance", rows)
+    # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     position_std = _not_negative(check, "position_std", rows)
@@ -147,6 +152,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check.problems.raise_if_any()
     assert rotation is not None
     static_end = links.static_end
+    # Copies, as broadcast views are read-only.
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
     if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
@@ -154,6 +160,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
+    # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
         check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
     elif named:
@@ -163,12 +170,14 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, values, mask, links.censored)
+    # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
         check.refuse_rows(measured, _rows(target, _infinite), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
+    # Variances scale with the square of the amplitude that was divided out.
     noise = None if noise is None else (noise / scale**2).astype(np.float32)
     data = assemble(
         kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
@@ -187,12 +196,14 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
     if normalisation not in NORMALISATIONS:
         check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
     error, stand_in = attributes.get("convergence_error"), attributes.get("stand_in")
+    # In Python bool is an int: `true` would be an error of 1.
     number = isinstance(error, int | float) and not isinstance(error, bool)
     if error is not None and not (number and np.isfinite(error) and error >= 0):
         error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
     for name in ("name", "stand_in"):
         if not isinstance(attributes.get(name), str | None):
             check.refuse(name, f"a {type(attributes[name]).__name__}; expected text")
+    # Linear powers are watts if the file says nothing, levels are dB of an unknown reference.
     level_unit, unit = str(attributes.get("level_unit", "dBW" if measured == "rssi" else "dB")), None
     if measured in ("rssi", "rssi_db"):
         linear = "W" if level_unit == "dBW" else LINEAR
@@ -256,6 +267,7 @@ Test = Callable[[np.ndarray], np.ndarray]
 
 def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
     """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
+    # Magnitudes of complex64 overflow and comparisons with NaN warn; both are tested for here.
     with np.errstate(over="ignore", invalid="ignore"):
         unmarked = "not finite; expected numbers (mark what was not measured in mask)"
         check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
@@ -314,8 +326,10 @@ def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) ->
     """Note positions in one plane: a source and its mirror image in it are indistinguishable."""
     if carrier_hz is None:
         return
+    # Square root of the least eigenvalue: the spread along the normal of the best plane [m].
     thickness = float(np.sqrt(np.linalg.eigvalsh(np.cov(moving.T))[0].clip(0)))
     wavelength = LIGHT / carrier_hz
+    # Twice a quarter wavelength: paths of a source and of its mirror image differ by half a wave.
     if thickness < wavelength / 4:
         check.notes.append(
             f"the positions spread only {thickness:.2g} m ({thickness / wavelength:.2g} wavelengths) about a "
@@ -336,7 +350,9 @@ def _directions(
         return None
     owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
     if name == "path_last_point":
+        # Transposed rotation: from the world to the receiver's frame, in which spectra and arrays are.
         vectors = np.einsum("pji,pj->pi", rotation[owner], vectors - rx[owner])
+    # Directions of any length are taken, so that overflow here is a row to refuse, not an error.
     with np.errstate(over="ignore"):
         length = np.linalg.norm(vectors, axis=-1)
     bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
@@ -352,6 +368,7 @@ def _scaled(
     """The target as stored and the constant it was divided by (0 for silence); censored rows are levels."""
     mask_or_level = mask
     if censored is not None:
+        # A censored row's target is the level of hearing, which the loss needs though the mask says False.
         bound = censored[:, None] != 0
         mask_or_level = bound if mask is None else mask | bound
     if mask_or_level is not None:

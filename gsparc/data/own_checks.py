@@ -15,6 +15,7 @@ from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
 
+# From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
 
 
@@ -29,7 +30,7 @@ class Checker:
         self.unknown: str | None = None  # a position that nobody gave
 
     def where(self, name: str) -> str:
-        """How messages name an array of this file."""
+        """Say how messages name an array of this file."""
         return f"{self.source}, {name}"
 
     def refuse(self, name: str, what: str) -> Any:
@@ -43,17 +44,18 @@ class Checker:
         return len(rows) > 0
 
     def given(self, *names: str) -> list[str]:
-        """Those of `names` that the file holds."""
+        """Return those of `names` that the file holds."""
         return [name for name in names if name in self.raw.arrays]
 
     def names(self) -> None:
-        """Misspelt names are refused, other unknown ones are noted as ignored; units must be the schema's."""
+        """Refuse misspelt names and foreign units; note that other unknown names are ignored."""
         for name in self.raw.arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
                 if unit != FIELDS[name].unit:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 continue
+            # A name that the file holds, too, cannot be what the misspelt one was to be.
             close = [n for n in difflib.get_close_matches(name, FIELDS, n=3) if n not in self.raw.arrays]
             if close:
                 self.refuse(name, f"unknown name; did you mean {close[0]}?")
@@ -61,7 +63,7 @@ class Checker:
                 self.notes.append(f"{name}: not part of the schema, ignored")
 
     def measurement(self) -> str | None:
-        """Which of spectrum, csi, rssi, rssi_db to read: the only one, or the one that an attribute names."""
+        """Choose spectrum, csi, rssi or rssi_db: the only one, or the one that an attribute names."""
         present, named = self.given(*MEASUREMENTS), self.raw.attributes.get("measurement")
         if named is not None and named not in present:
             there = " and ".join(present) or "none of these"
@@ -75,7 +77,7 @@ class Checker:
         return self.problems.add(self.source, f"{wanted}; found {names}")
 
     def name_rows(self, rows: int) -> list[str]:
-        """What messages call each row: `row_name`, or its number."""
+        """Return what messages call each row: `row_name`, or its number."""
         names = self.raw.arrays.get("row_name")
         self.row_names = [f"row {i}" for i in range(rows)]
         if names is not None and self.fits("row_name", names, (rows,)):
@@ -83,27 +85,29 @@ class Checker:
         return self.row_names
 
     def array(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """Array `name` when it is of its kinds of dtypes and fits one of `shapes` (None: any length)."""
+        """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
         array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
         if array is None:
             return None
+        # Images of uint16 hold no stated largest value; of uint8 it is 255.
         wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
         if array.dtype.kind not in kinds or wide:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
         return array if self.fits(name, array, *shapes) else None
 
     def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """The same as float64."""
+        """Return the same as float64."""
         array = self.array(name, *shapes)
         return None if array is None else array.astype(np.float64)
 
     def fits(self, name: str, array: np.ndarray, *shapes: tuple[int | None, ...]) -> bool:
-        """Whether `array` has one of `shapes`; notes it when not."""
+        """Tell whether `array` has one of `shapes`; note it when not."""
         for shape in shapes:
             if array.ndim == len(shape) and all(
                 want is None or want == size for want, size in zip(shape, array.shape, strict=True)
             ):
                 return True
+        # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
         turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
         constrained = any(count is not None for shape in shapes for count in shape)
         here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
@@ -113,7 +117,7 @@ class Checker:
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
-        """(S, 3) or (3,) float64 [m]."""
+        """Return (S, 3) or (3,) float64 [m]."""
         if name not in self.raw.arrays:
             remedy = "; or say dataset.tx_position=[X,Y,Z]" if name == "tx_position" else ""
             return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}")
@@ -123,11 +127,13 @@ class Checker:
         rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
         names = rows_named if array.ndim == 2 else ["its value"]
         known = np.atleast_2d(array)
+        # Places that nobody gave are NaN on purpose and pass unchecked.
         if name == self.unknown:
             return array
         if check_positions(self.problems, self.where(name), known, names):
             return None
         stored = self.raw.arrays[name]
+        # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
         step = float(np.spacing(np.abs(stored).max())) if stored.dtype.kind == "f" else 0.0
         if stored.dtype.itemsize <= 4 and step > 1e-3:
             self.notes.append(
@@ -137,13 +143,14 @@ class Checker:
         return array
 
     def mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
-        """Bool, like the measurement; None when all was measured. Only `censored` rows may be empty."""
+        """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
         array = self.array("mask", shape)
         if array is None:
             return None
         if not np.isin(array, (0, 1)).all():
             return self.refuse("mask", f"expected True and False, found {array.dtype} of other values")
         mask = array.astype(bool)
+        # A row without a measured entry has no error to learn from and no power to scale by.
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
         if censored is not None:
             empty &= censored == 0
@@ -151,7 +158,7 @@ class Checker:
         return mask
 
     def frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
-        """(K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` of them (None without csi)."""
+        """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
         frequency = self.real("frequency_hz", (), (None,) if count is None else (count,))
         if count is not None and "frequency_hz" not in self.raw.arrays:
             fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
@@ -173,6 +180,7 @@ class Checker:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
         if frequency is None:
             return None, None if carrier is None else float(carrier)
+        # A single frequency with several columns: they may be antennas, and then the shape is wrong.
         if frequency.ndim == 0 and count not in (None, 1):
             self.refuse(
                 "frequency_hz",
@@ -183,8 +191,9 @@ class Checker:
         return np.atleast_1d(frequency), float(frequency.mean() if carrier is None else carrier)
 
     def rotation(self, rows: int) -> np.ndarray | None:
-        """(S, 3, 3) local to world; the identity when the file says nothing."""
+        """Return (S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.given("rx_orientation", "rx_rotation")
+        # Two statements of one rotation can disagree, and nothing says which is right.
         if len(present) == 2:
             fault = "rx_orientation and rx_rotation are both given; expected one of them"
             return self.problems.add(self.source, fault)
@@ -206,7 +215,7 @@ class Checker:
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
 
     def grid(self, height: int, width: int) -> SphereGrid | None:
-        """Directions of the pixels; row i, column j at i and j steps from the horizon by default."""
+        """Return directions of the pixels; by default row i, column j at i and j steps from the horizon."""
         if "grid_deg" not in self.raw.arrays:
             return SphereGrid.hemisphere(height, width)
         values = self.real("grid_deg", (4,))
@@ -216,6 +225,7 @@ class Checker:
         last = elevation + (height - 1) * elevation_step
         if not np.isfinite(values).all() or elevation_step <= 0 or azimuth_step <= 0:
             return self.refuse("grid_deg", "expected four finite numbers, the two steps positive")
+        # Rounded steps of whole hemispheres end at 90 degrees but for some digits.
         if elevation < -90 - 1e-6 or last > 90 + 1e-6:
             fault = f"elevations run from {elevation:g} to {last:g}; expected -90 to 90"
             return self.refuse("grid_deg", fault)
@@ -225,13 +235,14 @@ class Checker:
         return SphereGrid(height, width, *(math.radians(v) for v in values))
 
     def ragged(self, rows: int) -> np.ndarray | None:
-        """path_offsets (S + 1,) int64."""
+        """Return path_offsets (S + 1,) int64."""
         per_path = self.given(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
         if per_path and "path_offsets" not in self.raw.arrays:
             return self.refuse("path_offsets", f"missing, but {per_path[0]} is given")
         offsets = self.array("path_offsets", (rows + 1,))
         if offsets is None:
             return None
+        # Cast first: differences of unsigned integers wrap around and never are negative.
         if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
             return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
         for name in per_path:
@@ -241,7 +252,7 @@ class Checker:
         return offsets.astype(np.int64)
 
     def release_split(self, rows: int) -> TrainTest | None:
-        """(train, test) rows that the file names, or None."""
+        """Return (train, test) rows that the file names, or None."""
         names = self.given("split_train", "split_test")
         if len(names) == 1:
             self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
@@ -268,7 +279,7 @@ UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this
 
 
 def is_unit(quaternion: np.ndarray) -> np.ndarray:
-    """Whether quaternions (..., 4) are finite and of length 1 within `UNIT_TOLERANCE`: (...) bool."""
+    """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...) bool."""
     return np.abs(_length(quaternion) - 1) <= UNIT_TOLERANCE
 
 
@@ -278,7 +289,7 @@ def _length(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
-    """Rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
+    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
 
     Raises:
         ValueError: a quaternion is not finite or its length differs from 1 by more than 1 %.
@@ -287,13 +298,15 @@ def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.nd
     if not is_unit(q).all():
         order = "w, x, y, z" if scalar_first else "x, y, z, w"
         raise ValueError(f"expected a quaternion ({order}) of length 1, got length {_length(q)!s}")
+    # SciPy expects the scalar last and normalises, which removes the rounding of printed digits.
     if scalar_first:
         q = np.roll(q, -1, axis=-1)
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 
 def is_rotation(matrix: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
-    """Whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
+    """Tell whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
+    # Products of huge or missing numbers are refused below, so that NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
     good = np.isfinite(matrix).all(axis=(-1, -2)) & (error <= tolerance)

@@ -82,7 +82,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def unpickled(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
-    """What a pickle holds, of arrays, plain values and `Stored`.
+    """Read what a pickle holds, of arrays, plain values and `Stored`.
 
     Args:
         path: of the file.
@@ -107,7 +107,7 @@ def unpickled(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
 
 
 def unpickled_frame(path: Path) -> dict[str, np.ndarray]:
-    """Columns (rows,) of a pickled pandas table by their names, whatever pandas is installed.
+    """Read columns (rows,) of a pickled pandas table by their names, whatever pandas is installed.
 
     Raises:
         DataError: as `unpickled`, or it is no table.

@@ -44,7 +44,7 @@ def load(path: str | Path) -> Autoencoder:
 
 
 def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
-    """Places (S, 3) float64 of uplinks (S, A, L), of the order of metres.
+    """Return places (S, 3) float64 of uplinks (S, A, L), of the order of metres.
 
     Raises:
         DataError: the encoder was made for other antennas or tones.
@@ -60,7 +60,7 @@ def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
 def encoder_for(
     folder: Path, settings: EncoderSettings, file: str | Path | None = None
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """What `load_argos` asks for places: uplinks (S, U, L) and training rows (n,) to places (S, 3) [m].
+    """Return what `load_argos` asks for places: uplinks (S, U, L), training rows (n,) to (S, 3) [m].
 
     By a given encoder `file`, or one trained once on these rows and kept in `folder`. Asking raises
     `DataError` where the file is no encoder of such uplinks.
@@ -138,11 +138,11 @@ class Autoencoder(nn.Module):
         self.register_buffer("scale", torch.ones(width))
 
     def normalised(self, features: Tensor) -> Tensor:
-        """Features (B, F) with the stored mean and scale removed."""
+        """Return features (B, F) with the stored mean and scale removed."""
         return (features - self.mean) / self.scale
 
     def code(self, features: Tensor) -> Tensor:
-        """Places (B, 3) in (-1, 1)."""
+        """Return places (B, 3) in (-1, 1)."""
         return torch.tanh(self.encoder(self.normalised(features)) / 2)
 
 
@@ -152,7 +152,7 @@ def _layers(width: int, hidden: int, out: int) -> nn.Sequential:
 
 
 def spread(codes: Tensor) -> Tensor:
-    """Mean of -log of the distance from codes (B, 3) to the nearest other; small where they fill space.
+    """Return the mean of -log of the distance of codes (B, 3) to the nearest other: small, they fill space.
 
     Minus the entropy of Kozachenko and Leonenko (1987), up to constants.
     """
@@ -188,7 +188,7 @@ FLOOR = 1e-12
 
 
 def features(uplink: np.ndarray) -> np.ndarray:
-    """Real features (S, F) float32 of uplinks (S, A, L) complex.
+    """Return real features (S, F) float32 of uplinks (S, A, L) complex.
 
     Logarithmic power, correlations between antennas (directions), between tones (delays up to one common
     delay, of which only the modulus is kept), and the logarithmic power of each antenna relative to all.

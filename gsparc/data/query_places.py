@@ -21,6 +21,7 @@ from gsparc.data.tables.places import Places, places
 from gsparc.data.tables.read import NOTHING
 from gsparc.data.tables.sheet import Sheet
 
+# Only what a query needs: a column that looks like a level is none of its concern.
 GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
 
 
@@ -70,18 +71,20 @@ def read_query_places(
         if is_table(path):
             return _of_table(path, moving, columns)
         named = [name for name, value in columns.items() if value is not None]
+        # Settings of columns have no meaning for named arrays, and would be ignored without a word.
         if named:
             raise DataError(f"columns.{named[0]}: goes with tables (*.csv, *.parquet), not with {path}")
         return _of_arrays(read_raw(path), str(path), moving)
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
         first = error.problems[0].replace("dataset.columns", "columns")
+        # The first problem alone: a table of queries is mostly wrong in the same way in every row.
         more = len(error.problems) - 1
         raise DataError(first + (f" (and {more} more)" if more else "")) from None
 
 
 def read_times(path: str | Path) -> np.ndarray | None:
-    """When each place was visited, (n,) [s], from the column or array `time_s`; None where there is none.
+    """Read when (n,) [s] each place was visited, column or array `time_s`; None where there is none.
 
     Raises:
         DataError: no such file, or a time that is no number, with its row.
@@ -99,6 +102,7 @@ def read_times(path: str | Path) -> np.ndarray | None:
         check = Checker(raw, str(path))
         times = check.real("time_s", (), (None,))
         check.problems.raise_if_any()
+        # One time for all places is a number without an axis.
         times = np.atleast_1d(np.asarray(times))
         rows = tuple(f"row {i}" for i in range(len(times)))
     assert times is not None
@@ -118,9 +122,11 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     ends: dict[End, Places] = {}
     for end in moving:
         named = f"{end}_" if f"{end}_" in rest else ""
+        # Coordinates without a name are taken once: a second end without its own is missing.
         if named not in rest or (len(moving) > 1 and not named and "" in ends):
             raise DataError(_missing(sheet, end, len(moving) > 1))
         ends[end] = rest.pop(named)
+    # Static ends stand where they were measured: a query cannot move them.
     other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
@@ -128,6 +134,7 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     plain = None if station is None else sheet.words(chosen["station"][0].head or "")
     sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
+    # Columns that were read as one quantity; joined stations are several columns and stay as text.
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
     return _checked(QueryPlaces(str(path), ends, sheet.rows, station, plain, name, (*notes, *guessed), table))
@@ -153,6 +160,7 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     check.problems.raise_if_any()
     ends: dict[End, Places] = {end: where for end, where in by_end.items() if where is not None}
     count = {end: len(where.across) for end, where in ends.items()}
+    # A row asks about one link: both ends have a place in it.
     if len(set(count.values())) > 1:
         raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
     rows = tuple(f"row {i}" for i in range(next(iter(count.values()))))
@@ -163,6 +171,7 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
 
 def _end(check: Checker, end: End, alone: bool) -> Places | None:
     """Places (n,) of an end; those without its name are of the one that is `alone`."""
+    # Unnamed arrays are taken only if one end moves, as they say nothing of which.
     position = check.given(f"{end}_position", *(("position",) if alone else ()))[:1]
     pair = check.given("latitude", "longitude") if alone else []
     if position and pair:
@@ -172,6 +181,7 @@ def _end(check: Checker, end: End, alone: bool) -> Places | None:
         wanted = "latitude and longitude, or " if alone else ""
         fault = f"no places of the {ENDS[end]}; expected {wanted}{end}_position"
         return check.problems.add(check.source, fault)
+    # Two columns are x and y without a height, which `with_heights` fills later.
     shapes = ((2,), (3,), (None, 2), (None, 3)) if position else ((), (None,))
     parts = [check.real(name, *shapes) for name in position or pair]
     known = [part for part in parts if part is not None]
@@ -184,6 +194,7 @@ def _end(check: Checker, end: End, alone: bool) -> Places | None:
     across = np.column_stack(known) if pair else np.atleast_2d(known[0])
     height = across[:, 2] if across.shape[1] == 3 else None
     for name in check.given(f"{end}_height", *(("height",) if alone else ())):
+        # The third coordinate is the height; a second statement of it is not read.
         values = None if height is not None else check.real(name, (), (1,), (len(across),))
         height = height if values is None else np.broadcast_to(values, (len(across),))
     return Places(across[:, :2], height, bool(pair))
@@ -198,6 +209,7 @@ def _stations(raw: Raw, source: str, count: int) -> np.ndarray | None:
         fault = f"found {station.dtype} of shape {raw.arrays['station'].shape}"
         raise DataError(f"{source}, station: expected {count} names or numbers, {fault}")
     names = raw.arrays.get("station_name")
+    # Numbers refer to the file's own list, text to the model's names.
     if station.dtype.kind in "iu" and names is not None:
         wrong = np.flatnonzero((station < 0) | (station >= names.size))
         if len(wrong):
@@ -217,6 +229,7 @@ def _checked(queries: QueryPlaces) -> QueryPlaces:
             row, axis = wrong[0]
             fault = f"{names[axis]} of the {ENDS[end]} is {values[row, axis]}; expected a finite number"
             raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
+        # On Earth before anything is projected: 91 degrees of latitude have finite metres too.
         off_earth = bad_degrees(*where.across.T) if where.degrees else None
         if off_earth is not None:
             raise DataError(f"{queries.source}, {queries.rows[off_earth[0]]}: {off_earth[1]}")

@@ -145,7 +145,7 @@ def _digest(raw: Raw) -> str:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file is a zip archive from its first byte on."""
+    """Tell whether a file is a zip archive from its first byte on."""
     try:
         with path.open("rb") as file:
             if file.read(4) != b"PK\x03\x04":
@@ -156,7 +156,7 @@ def is_archive(path: Path) -> bool:
 
 
 def stored_archive(path: Path) -> BytesIO:
-    """What `torch.save` wrote, written anew from bytes whose checksums are right.
+    """Return what `torch.save` wrote, written anew from bytes whose checksums are right.
 
     torch looks at no checksum, takes entries marked as folders for read, and inflates what is deflated
     whatever its size.
@@ -345,12 +345,12 @@ def refuse_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
 
 
 def numbered_rows(count: int) -> np.ndarray:
-    """What rows (count,) are called that their file does not name."""
+    """Return what rows (count,) are called that their file does not name."""
     return np.array([f"row {i}" for i in range(count)])
 
 
 def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:
-    """The same content with arrays renamed from the keys to the values of `names`."""
+    """Return the same content with arrays renamed from the keys to the values of `names`."""
     return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
 
 
@@ -369,7 +369,7 @@ with h5py.File(sys.argv[1], "r") as file:
 
 
 def read_error(path: Path, seconds: float = SECONDS) -> str | None:
-    """Why text in an HDF5 file cannot be read within `seconds`; None when it can, or when there is none."""
+    """Say why text in HDF5 cannot be read within `seconds`; None when it can, or when there is none."""
     if not _has_heap(path):
         return None
     try:
@@ -395,7 +395,7 @@ NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is
 
 
 def read_netcdf(path: str | Path) -> Raw:
-    """Every variable of the root group; text as text, fill values of floating point numbers as NaN.
+    """Read every variable of the root group; text as text, fill values of floating point numbers as NaN.
 
     Raises:
         DataError: no such file, another format, or damaged.

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
 Kind = Literal["spectrum", "csi", "rssi"]
+# Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
@@ -78,6 +79,7 @@ class Links:
     def named(self, rows: list[str]) -> list[str]:
         """Return names (S,) of rows, with their stations."""
         if self.stations is None or self.station is None:
+            # A row of a file of links is a place and a station; the place alone would name several rows.
             return rows
         names = self.stations.name
         return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
@@ -155,6 +157,7 @@ class Site:
     @property
     def scored(self) -> Scored:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
+        # Only channels have phases: powers and spectra are the same under any factor.
         return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
 
     def need_phase(self, what: str) -> None:
@@ -165,10 +168,12 @@ class Site:
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
         """The end whose position is the query; the receiver where both move."""
+        # Both may move: the receiver is then the one that single-ended code asks about.
         return OTHER.get(self.static_end or "", "rx")
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6) of both."""
+        # A static receiver's pose has no leading axis, a batch of poses has one.
         place = rx.position.reshape(-1, 3)
         if self.static_end is None:
             return torch.cat([tx, place.expand(len(tx), 3)], dim=1)
@@ -189,6 +194,7 @@ class Site:
         """Why these spectra cannot be modelled through the receive array; None when they can."""
         if self.kind != "spectrum" or self.grid is None:
             return f"targets are {self.kind}, not spectra on a grid"
+        # Plane waves at fixed elements: with a moving array each row would have another manifold.
         if self.static_end != "rx":
             return "the receiver moves; its array must be static"
         if self.array is None or len(self.array) < 2:
@@ -219,6 +225,7 @@ class Site:
             ValueError: another unit, or one that these levels cannot be turned into.
         """
         wanted = PowerUnit.of(unit, self.level_unit, levels=True)
+        # Powers scale linearly, amplitudes of channels and spectra with the root.
         scale = self.target_scale * (wanted.scale if self.kind == "rssi" else wanted.scale**0.5)
         return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
 
@@ -301,14 +308,17 @@ class Measurements:
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Return targets of the given rows as float32 or complex64, in stored units."""
         chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))
+        # uint8 images are kept as read, a quarter of float32's memory, and become [0, 1] by batches.
         return chosen.float() / 255 if chosen.dtype == torch.uint8 else chosen
 
     def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
         """Return rows (n,) alone, seen as measurements of `site`."""
 
         def of(value: Any) -> Any:
+            # Lists may be empty, for instance row names of data made from arrays.
             return [value[i] for i in rows if value] if isinstance(value, list) else take(value, rows)
 
+        # A release's split names rows of the whole, which the subset numbers otherwise.
         whole = ("site", "provenance", "release_split")
         arrays = {name: value for name, value in vars(self).items() if name not in whole}
         parts = {name: of(value) for name, value in arrays.items() if value is not None}
@@ -317,6 +327,7 @@ class Measurements:
     def batch(self, index: np.ndarray | Tensor) -> Batch:
         """Return the given rows as one batch."""
         rows = np.asarray(index)
+        # One pose for the whole batch: kernels then plan the view once.
         if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
             first = rows[:1]
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
@@ -335,6 +346,7 @@ class Measurements:
 
     @staticmethod
     def _f32(array: np.ndarray) -> Tensor:
+        # Local coordinates are centred on the site: at 500 m float32 has steps of 0.03 mm.
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
 

@@ -27,6 +27,7 @@ FEWEST = 2  # rows of a dataset
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample, station or path, and how many axes they then have.
 ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
+# Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
 ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
@@ -89,6 +90,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
     Raises:
         DataError: a setting that the file cannot follow, or nothing is left.
     """
+    # Steps of levels come first: they divide stations, whose parts are then kept or left out together.
     raw, notes = split_stations(raw, selection.level_steps or {}, source), list[str]()
     steps: tuple[Callable[..., Noted], ...] = (keep_stations, keep_runs, keep_above, keep_rows)
     for keep, value in zip(steps, vars(selection).values(), strict=False):  # the last are level steps
@@ -99,7 +101,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Noted:
 
 
 def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Noted:
-    """The links of some stations only; the others' columns, or rows of a long file, are left out.
+    """Keep the links of some stations only; others' columns, or rows of a long file, are left out.
 
     Args:
         stations: names of `station_name`, or numbers from 0.
@@ -125,7 +127,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
 
 
 def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
-    """The rows of some runs only.
+    """Keep the rows of some runs only.
 
     Raises:
         DataError: the file names no runs, or not these.
@@ -141,7 +143,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
 
 
 def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
-    """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
+    """Keep powers of at least `min_rssi_db` [dB]; what is below is not measured, rather than not heard.
 
     Raises:
         DataError: the file holds no powers, or none is left.
@@ -151,6 +153,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         raise DataError(f"{option}: {source} holds {name}; expected powers, rssi or rssi_db")
     values = raw.arrays[name]
     with np.errstate(divide="ignore", invalid="ignore"):
+        # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
         low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
     mask = raw.arrays.get("mask")
     if mask is not None and mask.shape != low.shape:
@@ -158,6 +161,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     low &= True if mask is None else mask.astype(bool)
     if low.ndim == 1:
         return _select(raw, ~low, option, source)
+    # A wide file cannot leave out single links: they are marked as not measured.
     measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
@@ -166,7 +170,7 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
 
 
 def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
-    """At most `max_rows` rows that cover the campaign as all rows do.
+    """Keep at most `max_rows` rows, which cover the campaign as all rows do.
 
     The file's order is cut into `max_rows` stretches of equal length, and of each one row is drawn, with a
     fixed seed: every stretch of a walk stays, and rows of a raster are not hit in step with its lines, as
@@ -183,7 +187,7 @@ def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Noted:
 
 
 def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None = None) -> Arrays:
-    """Rows (n,), which may repeat, of all arrays that have one for each of `count`; splits and paths follow.
+    """Take rows (n,), which may repeat, of all arrays with one for each of `count`, splits and paths too.
 
     Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
     reads them to refuse. Splits without rows are left out.
@@ -193,6 +197,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
         if _per_row(name, array, stations) and array.ndim and len(array) == count:
             part[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
+            # Rows may repeat or be gone: a row of the split then stands in several places, or in none.
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
@@ -200,6 +205,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
     offsets = arrays.get("path_offsets")
     if offsets is not None and offsets.shape == (count + 1,) and offsets.dtype.kind in "iu":
         offsets = offsets.astype(np.int64)
+        # Offsets that decrease are refused by whoever reads paths; until then such rows have none.
         lengths = np.diff(offsets).clip(0)[rows]
         part["path_offsets"] = np.concatenate([[0], np.cumsum(lengths)])
         for name in PATH_AXES:
@@ -211,7 +217,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
 
 
 def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
-    """The same file with the stations (n,) only, in their order; one may stand twice.
+    """Return the same file with the stations (n,) only, in their order; one may stand twice.
 
     Rows of a long file stay as they are.
 
@@ -260,14 +266,14 @@ def _stations(raw: Raw, option: str, source: str | Path) -> int:
 
 
 def parts_of(number: int, names: Sequence[str]) -> list[int]:
-    """Numbers of a station and of what its level steps made of it (`station_parts`), in the order of rows."""
+    """Return numbers of a station and its parts by level steps (`station_parts`), in the order of rows."""
     if number >= len(names):
         return [number]
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
 def known_station(wanted: str | int, names: Sequence[str], count: int, option: str, file: str | Path) -> int:
-    """`station_number`; the setting `option` of a `file` is named in errors.
+    """Return `station_number`; errors name the setting `option` of a `file`.
 
     Raises:
         DataError: there is none.
@@ -288,7 +294,7 @@ def _measurement(raw: Raw, source: str | Path) -> str:
 
 
 def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
-    """Where the measurement says something, of its shape: NaN is missing, or, with a sensitivity, not heard.
+    """Tell where the measurement says something: NaN is missing, or, with a sensitivity, not heard.
 
     Raises:
         DataError: the file holds no measurement.
@@ -300,12 +306,13 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
 
 
 def per_station(name: str, array: np.ndarray, count: int) -> bool:
-    """Whether an array of a file has an entry for each of `count` stations."""
+    """Tell whether an array of a file has an entry for each of `count` stations."""
     return array.ndim in STATION_AXES.get(name, ()) and len(array) == count
 
 
 def _per_row(name: str, array: np.ndarray, stations: int | None) -> bool:
     """Whether an array has a row per sample, by its name, its axes and how many stations there are."""
+    # Frequencies may be of stations or of rows: where the counts agree they are of stations.
     if name == "carrier_hz" and array.ndim and len(array) == stations:
         return False
     return name in ALWAYS or array.ndim in ROW_AXES.get(name, ())
@@ -337,7 +344,7 @@ def _check_rows(rows: np.ndarray, option: str, source: str | Path) -> None:
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:
-    """Each station of `steps` becomes several of the same place and kind, `NAME`, `NAME from row 1162`, ...
+    """Split each station of `steps` into several at one place, `NAME`, `NAME from row 1162`, ...
 
     Args:
         raw: arrays of a file, named as in docs/reference/schema.md.
@@ -348,6 +355,7 @@ def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | P
         DataError: no such station or row, or the file has no stations.
     """
     for station, firsts in steps.items():
+        # Ascending, so that each step divides the part after the one before.
         for first in sorted(firsts):
             raw = _split(raw, station, first, source)
     return raw
@@ -371,5 +379,6 @@ def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
     if "station" in arrays:
         arrays["station"] = np.where((arrays["station"] == last) & after, count, arrays["station"])
     else:
+        # Before its step the new station was silent, and after it the old one.
         arrays["mask"][~after, count] = arrays["mask"][after, last] = False
     return replace(raw, arrays=arrays)

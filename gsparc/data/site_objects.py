@@ -22,7 +22,7 @@ class SiteObjects:
 
     @classmethod
     def of(cls, planes: np.ndarray | None = None, boxes: np.ndarray | None = None) -> SiteObjects:
-        """Planes (P, 4), boxes (B, 2, 3); None: there are none."""
+        """Build from planes (P, 4) and boxes (B, 2, 3); None: there are none."""
         planes = np.zeros((0, 4)) if planes is None else planes
         return cls(planes, np.zeros((0, 2, 3)) if boxes is None else boxes)
 
@@ -30,7 +30,7 @@ class SiteObjects:
         return len(self.planes) + len(self.boxes)
 
     def joined(self, other: SiteObjects) -> SiteObjects:
-        """These and others."""
+        """Join these and others."""
         both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return SiteObjects(*(np.concatenate(pair) for pair in both))
 
@@ -59,7 +59,7 @@ class GaussianCloud:
         return len(self.means)
 
     def covariances(self) -> np.ndarray:
-        """(N, 3, 3) [m^2]: R S S R^T (Kerbl et al. 2023, eq. 6)."""
+        """Return covariances (N, 3, 3) [m^2]: R S S R^T (Kerbl et al. 2023, eq. 6)."""
         turn = Rotation.from_quat(np.roll(self.quats, -1, axis=1)).as_matrix()
         half = turn * self.scales[:, None, :]
         return np.asarray(half @ half.transpose(0, 2, 1))

@@ -143,6 +143,7 @@ class SplitSettings(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # `stations` takes a number of stations there; everything else a list of rows.
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
             ROWS.check("leave_out", self.leave_out)
 
@@ -205,12 +206,15 @@ def make_split(
     if settings.name in ("stations", "runs"):
         local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
+        # Files of the release are its published split; `redraw` is for drawing others.
         its_own = settings.name == "random" and release_split is not None and not settings.redraw
         named = release_split if its_own else None
         if named is not None:
+            # Rows were renumbered when some were left out: from numbers of the file to those that remain.
             train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
             named = train, test
         elif place is not None:
+            # One row stands for each place: splits are made of places, so that no visit is on both sides.
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
@@ -233,6 +237,7 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
         return [(np.setdiff1d(np.arange(rows), test), test)]
     test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
     order = np.random.default_rng(settings.seed).permutation(rows)
+    # At least one row on either side, as rounding may leave none of a small share.
     train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
     return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
 
@@ -248,6 +253,7 @@ def usual_step(positions: np.ndarray) -> float:
     """
     side = extent = float(np.ptp(positions, axis=0).max())
     while side > 1e-12 * extent:
+        # Cells of the current side first, so that visits of one place do not make its step zero.
         places, step = positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]], 0.0
         if len(places) >= FEWEST_PLACES:
             some = places[evenly(len(places), SAMPLE)]
@@ -276,6 +282,7 @@ def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray
     reach = NEAR * usual_step(places)
     if reach == 0:
         return place
+    # A cell's diagonal is a quarter of `reach`: two representatives are at most 1.5 of it apart.
     joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)  # all nearer than `reach`
     return place if len(np.unique(joined)) == len(places) else numbered(joined[which.reshape(-1), None])
 
@@ -286,6 +293,7 @@ def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
     Cells first: thousands of visits of one place would be millions of pairs.
     """
     corner = np.floor((places - places.min(axis=0)) / cell).astype(np.int64)
+    # The sums wrap around on overflow, as a hash does: two cells hardly ever share a number.
     _, first, which = np.unique(corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True)
     one, two = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
     graph = coo_array((np.ones(len(one)), (one, two)), (len(first), len(first)))
@@ -303,6 +311,7 @@ def square_of(floor: np.ndarray, side: float) -> np.ndarray:
     >>> square_of(np.array([[0.5, 0.5], [0.9, 0.1], [3.5, 0.5]]), side=1.0)
     array([0, 0, 1])
     """
+    # Counted from zero, which `split_for` puts at the lowest place of the whole campaign.
     return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
@@ -345,6 +354,7 @@ def path_order(positions: np.ndarray) -> np.ndarray:
     nearest = np.median(cKDTree(positions).query(positions, k=2)[0][:, 1])
     if step <= PATH_STEP_RATIO * nearest:
         return rows
+    # Stable, so that places with equal coordinates stay in the order of the file.
     longest = int(np.argmax(np.ptp(positions, axis=0)))
     return np.argsort(positions[:, longest], kind="stable")
 
@@ -385,6 +395,7 @@ def indices_hash(folds: tuple[Fold, ...]) -> str:
     digest = hashlib.sha256()
     for fold in folds:
         for part in vars(fold).values():
+            # The length first: moving a row from one part to the next changes the hash.
             digest.update(len(part).to_bytes(8, "little") + part.astype("<i8").tobytes())
     return digest.hexdigest()
 
@@ -417,6 +428,7 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
         name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
     except FileNotFoundError:
         raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
+    # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
     if stored_rows != rows:
@@ -445,6 +457,7 @@ def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
     stretches = np.array_split(order, settings.folds * settings.stretches_per_fold)
     pairs = []
     for fold in range(settings.folds):
+        # Every folds-th stretch: one fold's stretches lie all over the site.
         test = np.concatenate(stretches[fold :: settings.folds])
         # Path order is kept here: the validation stretch is cut from it.
         rest = order[~np.isin(order, test)]
@@ -462,6 +475,7 @@ def _blocks(
         raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
     square = square_of(floor[rows], side)
     order = np.random.default_rng(seed).permutation(square.max() + 1)
+    # Whole squares are added until the share is reached: the test set is never smaller.
     sizes = np.cumsum(np.bincount(square)[order])
     count = int(np.searchsorted(sizes, share * len(rows))) + 1
     if count >= len(order):
@@ -496,6 +510,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     for fold, test in enumerate(test_units):
         rest = np.setdiff1d(np.arange(count), test)
         rest = np.random.default_rng([settings.seed, fold, 2]).permutation(rest)
+        # At least one to choose on, and one to learn from.
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
         parts = (np.setdiff1d(rest, chosen), chosen, test)
         folds.append(Fold(*(np.flatnonzero(np.isin(unit, part)) for part in parts)))
@@ -505,8 +520,10 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
 def _corner(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
     """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
     lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
+    # A site without extent along an axis is divided by 1: that axis tells no row from another.
     unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)
     corner = np.array([sign == "+" for sign in settings.corner], dtype=np.float64)
+    # The larger of the two distances: its level lines are rectangles about the corner.
     depth = np.abs(unit - corner).max(axis=1)
     count = max(round(settings.test_fraction * len(positions)), 1)
     test = np.sort(np.argsort(depth, kind="stable")[:count])
@@ -518,6 +535,7 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
     """Thin the training rows, then set some of them aside for validation."""
     if s.spacing_m is not None:
         train = far_apart(positions, train, s.spacing_m, [s.seed, fold, 3])
+    # A stream of draws for each purpose (1 thinning, 2 validation, 3 spacing): none shifts another's.
     rng = np.random.default_rng([s.seed, fold, 1])
     keep = len(train) if s.train_count is None else s.train_count
     keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0
@@ -533,9 +551,11 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
         count = max(count, 1)
     rng = np.random.default_rng([s.seed, fold, 2])
     if s.name == "grouped":
+        # A stretch in one piece: single rows between training rows of a path would be too easy.
         start = int(rng.integers(len(train) - count + 1))
         chosen = np.arange(start, start + count)
     elif s.name == "blocks" and count:
+        # Validation as hard as the test: whole squares as well.
         chosen = np.searchsorted(train, _blocks(positions, train, s, s.val_fraction, [s.seed, fold, 2]))
     else:
         chosen = rng.permutation(len(train))[:count]

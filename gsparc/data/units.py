@@ -29,7 +29,7 @@ class Unit:
     offset: float = 0.0
 
     def convert(self, values: np.ndarray) -> np.ndarray:
-        """Values of this unit in the schema's unit of its kind."""
+        """Convert values of this unit to the schema's unit of its kind."""
         return values if (self.factor, self.offset) == (1.0, 0.0) else values * self.factor + self.offset
 
     @property
@@ -48,7 +48,7 @@ UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "pow
 
 
 def known(kind: str) -> str:
-    """The units of a kind, for messages."""
+    """List the units of a kind, for messages."""
     return ", ".join(unit.name for unit in _LISTED if unit.kind == kind)
 
 
@@ -74,7 +74,7 @@ class PowerUnit:
 
     @classmethod
     def of(cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False) -> Self:
-        """The unit of a name, for stored powers that times `scale` have levels in `level_unit`.
+        """Return the unit of a name, for stored powers that times `scale` have levels in `level_unit`.
 
         Levels whose reference nobody said (`dB`) are in whatever unit of levels is asked for.
 
@@ -101,13 +101,13 @@ class PowerUnit:
         return 10 * math.log10(self.scale)
 
     def values(self, stored: Tensor) -> Tensor:
-        """Powers in the unit, like `stored`; levels are -inf of silence and NaN of what is less."""
+        """Return powers in the unit, like `stored`; levels are -inf of silence and NaN of what is less."""
         if self.decibels:
             return 10 * stored.double().log10() + self.raised_db
         return stored if self.scale == 1 else stored * self.scale
 
     def variance(self, stored: Tensor, variance: Tensor) -> Tensor:
-        """Of `values` (B,) float64, from stored powers (B, 1) or other targets, and their variance (B,).
+        """Return the variance (B,) of `values`, from stored powers (B, 1) or other targets and theirs (B,).
 
         Powers (B, T) of several stations have variances (B, T).
 
@@ -118,7 +118,7 @@ class PowerUnit:
         return variance.double() * self.scale**2
 
     def stored(self, values: Tensor) -> Tensor:
-        """The inverse of `values`, float64."""
+        """Invert `values`, in float64."""
         values = values.double()
         return 10 ** ((values - self.raised_db) / 10) if self.decibels else values / self.scale
 

@@ -43,7 +43,7 @@ class SceneWalls:
 
 
 def read_walls(path: str | Path | None) -> SceneWalls:
-    """Walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
+    """Read walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
 
     Raises:
         DataError: none is named, no such file, of another kind, or with walls that cannot be.
@@ -81,6 +81,7 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
         corners = finite(wall.get("corners_m") if isinstance(wall, dict) else wall)
         if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
             problems.add(where, "expected corners_m: [[x, y, z], ...] of at least 3 corners [m]")
+        # Corners on a line span no plane, and their normal would be rounding.
         elif area(corners) < SMALLEST_M2:
             problems.add(where, "its corners lie on a line")
         elif uneven(corners) > FLAT_M:
@@ -124,6 +125,7 @@ def _mesh(path: Path, problems: Problems) -> SceneWalls:
         name, *values = line.split("#")[0].split() or [""]
         try:
             if name == "v":
+                # A fourth value is a weight, further ones are colours: x, y and z are enough.
                 x, y, z = (float(value) for value in values[:3])
                 corners.append([x, y, z])
             elif name == "f":
@@ -131,9 +133,11 @@ def _mesh(path: Path, problems: Problems) -> SceneWalls:
         except (ValueError, IndexError):
             problems.add_rows(path, [f"line {number}"], f"{line.strip()!r} is no vertex or face of an OBJ")
         if len(problems) >= Problems.LIMIT:
+            # A file of another kind with this suffix is wrong in every line.
             break
     if not all(np.isfinite(face).all() for face in faces):
         problems.add(path, "a vertex is not finite")
+    # Exporters write triangles of no area, which have no normal.
     return SceneWalls(tuple(face for face in faces if area(face) >= SMALLEST_M2), np.zeros((0, 2, 3)))
 
 
@@ -153,7 +157,7 @@ def _triangles_or_flat(face: np.ndarray) -> list[np.ndarray]:
 
 
 def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """The six faces, each (4, 3), of a box between two corners (3,)."""
+    """Return the six faces, each (4, 3), of a box between two corners (3,)."""
     faces = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -166,17 +170,18 @@ def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
 
 
 def normal_of(corners: np.ndarray) -> np.ndarray:
-    """Normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
+    """Return the normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
+    # About the mean, as far from the origin the cross products would cancel each other.
     about = corners - corners.mean(0)
     return np.asarray(np.cross(about, np.roll(about, -1, axis=0)).sum(0))
 
 
 def area(corners: np.ndarray) -> float:
-    """Area of a polygon (C, 3) [m^2]."""
+    """Return the area of a polygon (C, 3) [m^2]."""
     return float(np.linalg.norm(normal_of(corners)) / 2)
 
 
 def uneven(corners: np.ndarray) -> float:
-    """Largest distance of corners (C, 3) from their plane [m]."""
+    """Return the largest distance of corners (C, 3) from their plane [m]."""
     normal = normal_of(corners)
     return float(np.abs((corners - corners.mean(0)) @ (normal / np.linalg.norm(normal))).max())

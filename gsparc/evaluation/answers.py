@@ -26,6 +26,7 @@ from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
 
+# 512 spectra of 90 x 360 pixels take 66 MB in float32: what a block costs in memory.
 CHUNK = 512  # places predicted at a time
 MOST_ENTRIES = 16  # of a channel, as columns of a table
 ENDINGS = (".csv", ".npz")
@@ -83,6 +84,7 @@ def predict(
     row, number = stations_of(queries, site, station)
     named = station is not None or queries.station is not None
     far, margin = far_outside(world, site)
+    # `check_fits` is asked after the first block: spectra for a csv are refused before all are predicted.
     predictions = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
     speck = in_a_speck(queries, world, site)
     if speck is not None:
@@ -103,6 +105,7 @@ def predict(
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,
     }  # fmt: skip
+    # A power of 0 is -inf dB, which would be the lowest of every file and no number of a summary.
     known = predictions.mean[np.isfinite(predictions.mean)]
     if power is not None and len(known):
         ends = {"lowest": float(known.min()), "highest": float(known.max())}
@@ -112,6 +115,7 @@ def predict(
 
 def _notes(queries: QueryPlaces, site: Site) -> list[str]:
     notes, origin = list(queries.notes), site.georeference
+    # Metres alone may be about any origin, and a wrong one moves all places alike: it is said.
     if origin is not None and not any(where.degrees for where in queries.ends.values()):
         notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
     if queries.station is not None and site.stations is None:
@@ -144,6 +148,7 @@ def answers(
     stations = predictor.site.stations
     blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
+    # By station: each may have a model of its own, whose matrices are then read once a block.
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
@@ -163,6 +168,7 @@ def answers(
         return own.predict(**ends)
 
     parts: list[tuple[np.ndarray, Prediction]] = []
+    # Blocks may end in any order in other processes: their rows travel with them.
     for block, prediction in each(predicted, range(len(blocks)), "blocks of places"):
         if not parts:
             accept(tuple(prediction.mean.shape[1:]))
@@ -170,6 +176,7 @@ def answers(
     for line in silent:
         log.warning(line)
     rows = np.concatenate([rows for rows, _ in parts])
+    # Blocks are of stations, answers are wanted in the order of places.
     order = np.argsort(rows, kind="stable")
     whole = Prediction.joined([prediction for _, prediction in parts], torch.from_numpy(order))
     variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
@@ -179,7 +186,7 @@ def answers(
 
 
 def target(out: str | None, places: Path, overwrite: bool) -> Path:
-    """Where predictions go: `out`, or beside the places.
+    """Return where predictions go: `out`, or beside the places.
 
     Raises:
         DataError: another ending, the places themselves, or a file that is there already.
@@ -187,6 +194,7 @@ def target(out: str | None, places: Path, overwrite: bool) -> Path:
     path = places.with_name(f"{places.stem}.predicted.csv") if out is None else Path(out)
     if path.suffix.lower() not in ENDINGS:
         raise DataError(f"out={path}: expected a name ending in {' or '.join(ENDINGS)}")
+    # Not a comparison of names: links and other spellings lead to one file, too.
     if path.exists() and path.samefile(places):
         raise DataError(f"out={path}: these are the places themselves; give another out=FILE")
     if path.exists() and not overwrite:
@@ -208,7 +216,7 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
 
 
 def suffix(unit: PowerUnit) -> str:
-    """Of columns and figures of powers: `db` of any levels, else the unit."""
+    """Return the ending of columns and figures of powers: `db` of any levels, else the unit."""
     return "db" if unit.decibels else unit.name
 
 
@@ -222,6 +230,7 @@ def write(
         values = predictions.mean[:, 0]
         columns[name] = np.where(np.isfinite(values), values, np.float32(np.nan))
     if predictions.variance is not None:
+        # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
         columns[f"{name}_std"] = np.sqrt(predictions.variance).astype(np.float32)
     if archive and kind != "rssi":
         columns[kind] = predictions.mean
@@ -232,6 +241,7 @@ def write(
         columns = _in_order(columns, queries, predictions)
         write_samples(path, {name: _cells(values) for name, values in columns.items()})
         return
+    # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
     with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **columns)
 
@@ -253,11 +263,13 @@ def _in_order(
     """The columns of a table of places in its order, those that were not read as they are, then the rest."""
     ordered: dict[str, np.ndarray] = {}
     for head, role, words in queries.table:
+        # With one end that moves columns have no prefix; "^$" takes nothing away.
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
         known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*ordered}]
         if role is not None and known:
             ordered[known[0]] = columns[known[0]]
         elif role is None:
+            # A user's own column called like one of ours keeps its words under another head.
             ordered[f"{head} (given)" if head in columns else head] = words[predictions.place]
     return {**ordered, **{name: values for name, values in columns.items() if name not in ordered}}
 
@@ -277,4 +289,5 @@ def _cells(values: np.ndarray) -> list[object]:
     """Text of numbers with as many digits as tell them from their neighbours; NaN stays a number."""
     if values.dtype.kind != "f":
         return values.tolist()
+    # str of a float32 has its shortest digits, .1; as a Python float it would be .10000000149.
     return [value if np.isnan(value) else str(value) for value in values]

@@ -17,6 +17,7 @@ from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
+# `zero` has NMSE 1 by definition: what is worse is worse than saying nothing.
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 
 
@@ -24,10 +25,12 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
     """Names of all plain methods that serve these measurements and rows."""
     site, names = data.site, BASELINES
     if site.kind == "rssi":
+        # Both fit decibels over distance, which only powers have.
         return (*names, "distance_law", "kriging")
     carrier = site.carrier_hz is not None or (
         site.stations is not None and site.stations.carrier_hz is not None
     )
+    # The kernel of `complex_gp` oscillates with the wavelength: without a carrier it is not defined.
     if site.kind != "csi" or not carrier:
         return names
     folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
@@ -70,6 +73,7 @@ def baseline(
     unseen = eval_on == "val" and learned is None
     methods, seconds = [], []
     for number, fold in enumerate(before.folds):
+        # Learning from `val` rows as methods do; where these are scored they must stay unseen.
         known = replace(fold, val=fold.val[:0]) if unseen else fold
         factory = for_stations(method_class(name)(), own)
         method, report = fit(factory, own, known, FitContext(Path()))

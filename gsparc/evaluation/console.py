@@ -54,7 +54,7 @@ class Screen(logging.StreamHandler):  # type: ignore[type-arg]
         self.warned: dict[str, tuple[int, str]] = {}  # by kind: how often, and the first
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether it is shown; counts warnings."""
+        """Return whether a record is shown; counts warnings."""
         if record.levelno < logging.WARNING:
             return not f"{record.name}.".startswith(self.quiet)
         message = record.getMessage()
@@ -63,13 +63,13 @@ class Screen(logging.StreamHandler):  # type: ignore[type-arg]
         return count == 0
 
     def format(self, record: logging.LogRecord) -> str:
-        """The message; of a warning or an error after its level."""
+        """Return the message; of a warning or an error after its level."""
         level = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
         return level + record.getMessage().strip().partition("\n")[0]
 
 
 def warned_again() -> list[str]:
-    """What a command says at its end of warnings that its log's file has more of: one line, or none."""
+    """Return a command's last line on warnings that its log's file has more of, or none."""
     screens = [one for one in logging.getLogger().handlers if isinstance(one, Screen)]
     more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
     again = [f"{n} like '{re.sub(PATH, '', first)[:AGAIN]} ...'" for n, first in more]
@@ -77,12 +77,12 @@ def warned_again() -> list[str]:
 
 
 def plain(node: DictConfig) -> dict[str, Any]:
-    """A group of settings as plain containers; a setting that is still missing is an error."""
+    """Return a group of settings as plain containers; a setting that is still missing is an error."""
     return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
 
 def one_line(error: BaseException) -> str:
-    """What went wrong and what to do, on one line; a misspelt key or choice gets the nearest right name."""
+    """Return what went wrong and what to do, on one line; misspelt keys and choices get the nearest name."""
     if isinstance(error, errors.MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, choice = str(error.missing_cfg_file).partition("/")
         if group == "hydra":  # hydra/sweeper/optuna
@@ -118,7 +118,7 @@ def one_line(error: BaseException) -> str:
 
 
 def config_folder() -> Path:
-    """Where the configurations are."""
+    """Return where the configurations are."""
     return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
 
 

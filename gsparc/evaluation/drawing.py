@@ -84,7 +84,7 @@ TOGETHER = "_together"  # ends the name of a method that serves all stations at 
 
 
 def look(method: str) -> Look:
-    """How a method is drawn; one without an entry by its name."""
+    """Return how a method is drawn; one without an entry by its name."""
     if method.endswith(TOGETHER):
         return look(method.removesuffix(TOGETHER))._replace(second=True)
     number = zlib.crc32(method.encode())
@@ -103,7 +103,7 @@ def numbered(number: int) -> dict[str, Any]:
 def panels(
     width: float, height: float, rows: int = 1, columns: int = 1, *, grid: bool = True, **how: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of `width` x `height` inches in our style and its axes (rows, columns), with grid lines.
+    """Return a figure of `width` x `height` inches in our style and axes (rows, columns) with grid lines.
 
     At most 9 inches of width stay readable at 600 pixels.
     """

@@ -24,6 +24,7 @@ from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, 
 log = logging.getLogger(__name__)
 
 REFERENCE = "gp"  # differences are paired with it
+# results.py reads the key render_ms_batch64 by this number.
 BATCH = 64
 SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
 FIELD = "field"  # Gaussians of the evaluated method, without the process that they are mixed with
@@ -82,15 +83,18 @@ def evaluate(
     if seconds is not None and len(seconds) != len(methods):
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     scores = score(methods, data, split, eval_on)
+    # Which baselines serve is decided by the rows that they learn from, not by those scored.
     names = fitting(*(learned or (data, split))) if baselines is None else baselines
     if fitted := [name for name in names if name != shared]:
         log.info("%-10s%s", "baselines", ", ".join(fitted))
+    # A method that is a baseline (model=gp) has one fit and one row: another would only differ in seconds.
     same = Fitted(methods, scores, tuple(seconds or ()))
     others = {n: same if n == shared else baseline(n, data, split, eval_on, learned) for n in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
     alone = [method.field_alone() for method in methods]
     fields = [one for one in alone if one is not None]
+    # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):
         every[FIELD] = score(fields, data, split, eval_on)
     for stem, one in every.items():
@@ -105,6 +109,7 @@ def evaluate(
         facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
     facts["time/train_s"] = None if seconds is None else float(np.mean(seconds))
     facts["time/train_total_s"] = None if seconds is None else float(sum(seconds))
+    # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
     if FIELD in every:
         contenders[FIELD], facts[f"{FIELD}/train_s"] = fields[0], facts["time/train_s"]
@@ -150,6 +155,7 @@ def latencies(
     singles = cycling(methods, queries(data, rows, 1))
     one = interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
+    # A median: one interruption by another process moves a mean of few rounds.
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
     many = interleaved(cycling(quick, queries(data, rows, BATCH)), fewer)
     copy_ms = float(np.median(one[COPY]))
@@ -198,11 +204,13 @@ def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
     """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour, or when that one is right."""
     if "nearest" not in others:
         return None
+    # Rows without a target are NaN in both, so that the means are over the same rows.
     own, bar = (float(np.nanmean(one.squares())) for one in (scores, others["nearest"].scores))
     return 1 - own / bar if bar > 0 else None
 
 
 def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:
+    # The last three are the moving end's place: where both move, columns are tx, then rx.
     world = data.moving[scores.row][:, -3:] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     columns: dict[str, Any] = {

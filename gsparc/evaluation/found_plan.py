@@ -56,13 +56,16 @@ def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndar
     first = True
     for normal, offset in zip(planes[:, :3], planes[:, 3] + planes[:, :3] @ origin, strict=True):
         flat = np.linalg.norm(normal[:2])
+        # .3 = sin 17.5 degrees from upright: a plane that leans more is no line from above.
         if abs(normal[2]) > UPRIGHT:
             continue
+        # On the plane n.x = d, n_z left out: the line n_xy.x = d is d / |n_xy| from the origin.
         across = normal[:2] / flat
         foot = middle + (offset / flat - across @ middle) * across
         ends = foot + np.array([[-1.0], [1.0]]) * reach * np.array([-across[1], across[0]])
         axis.plot(*ends.T, "-", color="tab:red", lw=1.5, label="mirror planes found" if first else None)
         first = False
+    # Between the two limits planes are neither wall nor floor: not drawn, not listed.
     lying = [n for n in range(len(planes)) if abs(planes[n, 2]) > 1 - UPRIGHT]
     heights = sorted((planes[n, 3] + planes[n, :3] @ origin) / planes[n, 2] for n in lying)
     heights_text = ", ".join(f"{height:.2f}" for height in heights)
@@ -90,6 +93,7 @@ def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:
 def _cut(face: np.ndarray, height: float) -> np.ndarray:
     """Points (m, 3) where the edges of a polygon (C, 3) pass a height [m]."""
     start, end = face, np.roll(face, -1, axis=0)
+    # Half-open on purpose: a corner exactly at the height is passed once, not by both its edges.
     passing = (start[:, 2] <= height) != (end[:, 2] <= height)
     start, end = start[passing], end[passing]
     share = (height - start[:, 2]) / (end[:, 2] - start[:, 2])

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from gsparc.data.links.georeference import Georeference
 
 MOST_POINTS = 1500  # measured places that are drawn
+# A city's mesh has millions of triangles; the short ones are not seen at this scale.
 MOST_WALLS = 50_000
 DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)], closed=True)
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
@@ -26,6 +27,7 @@ def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     labels = {"xlabel": "x [m]", "ylabel": "y [m]"} | labels
     across, up = np.transpose([low, high])
     axis.set(xlim=across, ylim=up, aspect="equal", **labels)
+    # UTM northings, 5e6 m, would be shown as small numbers beside an offset at the axis' end.
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
 
@@ -53,6 +55,7 @@ def framed(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndar
     """Corners (2,) of a map: the known ones of places (n, 2) and a share of their extent around them."""
     known = places[np.isfinite(places).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
+    # 1 mm: a single place, or places at one point, have a frame all the same.
     margin = max(float((high - low).max()), 1e-3) * share
     return low - margin, high + margin
 
@@ -64,7 +67,7 @@ def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", 
 
 
 def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
-    """A dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
+    """Draw a dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
     how: dict[str, Any] = {
         "linestyle": "",
         "color": "k",
@@ -72,6 +75,7 @@ def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
         "markersize": 17,
         "zorder": 4,
     }
+    # Azimuths turn clockwise from north, matplotlib's angles anticlockwise: hence the sign.
     for where, turn in zip(places, azimuth, strict=True):
         axis.plot(*where, marker=MarkerStyle(DART, transform=Affine2D().rotate_deg(-turn)), **how)
     axis.plot([], [], marker="d", label="sector", **how | {"markersize": 7})
@@ -81,6 +85,7 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
     """Places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
     if len(places):
         few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        # By the root of their number, so that the area that marks hide stays the same.
         size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
         rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
         axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
@@ -89,6 +94,7 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     """Upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    # .1 = sin 6 degrees from upright; 1e-12 m^2 keeps triangles without area from dividing by 0.
     upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][:, :, :2]
     ends = np.stack([upright, np.roll(upright, -1, axis=1)], axis=2)  # three sides of each
     length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
@@ -105,11 +111,12 @@ def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", abo
         text, where, xytext=(-7 if left else 7, 5 if above else -12), textcoords="offset points",
         ha="right" if left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=5,
     )  # fmt: skip
+    # Text at the rim would otherwise take width from the axes, whose scales are equal.
     note.set_in_layout(False)
 
 
 def scale_bar(axis: Any) -> None:
-    """A bar of a round length, about a fifth of the map wide."""
+    """Draw a bar of a round length, about a fifth of the map wide."""
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     decade = 10.0 ** np.floor(np.log10((right - left) / 5))
     length = max(one for one in (1, 2, 5) if one * decade <= (right - left) / 5) * decade
@@ -124,7 +131,7 @@ def scale_bar(axis: Any) -> None:
 
 
 def legend_below(figure: Any, columns: int = 3) -> Any:
-    """What marks are, beneath the map; returns the legend, None where nothing has a label."""
+    """Say beneath the map what marks are; returns the legend, None where nothing has a label."""
     if not any(axis.get_legend_handles_labels()[0] for axis in figure.axes):
         return None
     return figure.legend(loc="outside lower left", ncols=columns, fontsize="small", frameon=False)

@@ -11,6 +11,7 @@ from gsparc.data.units import in_decibels
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
+# 1e-4 of a power is .0004 dB: above float32 rounding (6e-8), below any two real levels.
 SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
 
 
@@ -23,6 +24,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     perfect, and `outage/brier_rate` what always saying the rate gives.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
+    # Decibels of a power need a mean above 0.
     known = np.isfinite(variance) & (variance > 0) & (mean > 0)
     if not known.any():
         return {}
@@ -33,6 +35,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     heard = (data.side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
+        # z of .95 is 1.645 for the central 90 % of a normal distribution.
         half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
         inside = np.abs(10 * np.log10(power[heard]) - mean_db[heard]) <= half
         figures |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
@@ -48,6 +51,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     return figures | {
         "outage/rate": rate,
         "outage/brier": float(np.mean((chance - silent[limited]) ** 2)),
+        # Brier 1950; saying the rate r each time gives its variance, r (1 - r).
         "outage/brier_rate": rate * (1 - rate),
     }
 
@@ -66,6 +70,7 @@ def levels(data: Measurements) -> np.ndarray | None:
     for number in np.unique(station[rows]):
         own = power[station[rows] == number]
         if np.ptp(own) <= SAME_LEVEL * own[0]:
+            # The target of a silent row is its level, a power in stored units.
             level[number] = 10 * np.log10(own[0] * data.site.target_scale)
     return level
 
@@ -79,8 +84,9 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     if not side.any():
         return {}
     level = data.target[scores.row, 0].astype(np.float64) * data.site.target_scale
-    tiny = np.finfo(np.float64).tiny
-    beyond = side * 10 * np.log10(np.maximum(prediction, tiny) / np.maximum(level, tiny))
+    # A prediction of 0 has no logarithm: it is the weakest level, as in `PowerMetrics`.
+    floor = level[level > 0].min() if (level > 0).any() else np.finfo(np.float64).tiny
+    beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
     error = np.where(side == 0, scores.samples["error_db"], np.maximum(beyond, 0.0))
     return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
 

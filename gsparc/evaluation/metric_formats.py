@@ -24,6 +24,7 @@ class Figure:
     better: Literal["larger", "smaller", "ratio"] = "larger"
 
 
+# SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default.
 FIGURES = {
     "psnr_db": Figure("PSNR dB", ".2f"),
     "ssim_gauss": Figure("SSIM (Gauss 11)"),
@@ -42,6 +43,7 @@ FIGURES = {
     "error_db": Figure("error dB", ".2f", "smaller"),
     "skill": Figure("skill", ".3f"),
 }
+# Order matters: `DECIDING` takes the first of each.
 TABLES: dict[Scored, tuple[str, ...]] = {
     "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
     "csi": ("nmse", "nmse_scalar", "snr_db"),
@@ -60,12 +62,12 @@ PER_SAMPLE: dict[Scored, str] = {
 
 
 def heading_of(name: str) -> str:
-    """Of a column or an axis; the name itself where it is not a figure of merit."""
+    """Return the heading of a column; the name itself where it is not a figure of merit."""
     return _look_up(name).heading
 
 
 def axis_of(name: str) -> str:
-    """Of an axis, with the unit in brackets."""
+    """Return the label of an axis, with the unit in brackets."""
     return heading_of(name).replace(" dB", " [dB]")
 
 
@@ -75,17 +77,19 @@ def form_of(name: str) -> str:
 
 
 def lower_is_better(name: str) -> bool:
-    """Whether a smaller value of a figure of merit is the better one."""
+    """Return whether a smaller value of a figure of merit is the better one."""
     return _look_up(name).better != "larger"
 
 
 def score_of(name: str, value: float) -> float:
-    """A number that is larger when the figure is better: in decibels for ratios of powers, else as it is."""
+    """Return a number that is larger when the figure is better: ratios in decibels, else as it is."""
     better = _look_up(name).better
     if better == "ratio":
+        # 1e-12 stands for a ratio of 0: 120 dB, beyond what float32 targets can tell.
         return -10 * math.log10(max(value, 1e-12))
     return -value if better == "smaller" else value
 
 
 def _look_up(name: str) -> Figure:
+    # Also of settings and seconds: shown by their own name.
     return FIGURES.get(name, Figure(name))

@@ -70,7 +70,7 @@ class Opened:
         return Predictor(self.methods[0], site, trusted=confidence.trusted_of(extra), extra=extra)
 
     def retraining(self, **others: Any) -> Learned:
-        """The first method with what it learned from; what makes it unfitted is of gsparc's classes alone.
+        """Return the first method with what it learned from; only classes of gsparc make it unfitted.
 
         Args:
             **others: of `FitContext`, in place of the run's.
@@ -88,6 +88,7 @@ class Opened:
             "stations": config.get("stations", "auto"),
             "split": None if split is None else split_settings(split),
         }  # fmt: skip
+        # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
         factory, context = build(config["model"], trusted=False), FitContext(**own | others)
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
@@ -111,12 +112,15 @@ def open_files(
     """
     loaded = [loading.load(path) for path in paths]
     stored = [one for _, one in loaded]
+    # Folds of two runs are of two splits: a test row of one may have taught the other.
     if len({one.extra.get("run_id") for one in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
+    # A class is imported only where the caller named it, never because a file does.
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
     data = aligned(module.measurements, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
+    # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
         none, every = np.zeros(0, np.int64), np.arange(len(data))
         folds = (Fold(none, none, every),) * len(stored)
@@ -156,6 +160,7 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
 
 def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     """The folds the checkpoints were trained on: all of them in order, or those each file names."""
+    # Files of some folds can be opened alone where each says its number; older ones are counted.
     named = all("fold" in one.extra for one in stored)
     numbers = [int(one.extra["fold"]) if named else index for index, one in enumerate(stored)]
     if not named and len(stored) != len(split.folds):
@@ -169,7 +174,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
 
 
 def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
-    """Whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
+    """Return whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
     """
@@ -196,14 +201,17 @@ def _foreign(
         what = "rows that it does not name" if same and known is None else what
         return f"{what}; these test rows may have been TRAINED on", None, None
     own, before = trained
+    # The same rows under another name or seed of split.
     if same and indices_hash(before.folds) == indices_hash(chosen.folds):
         return None, 0, trained
     learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
     for old, fold in zip(before.folds, chosen.folds, strict=True):
+        # Rows of `val` decide steps and weights: they count as learned.
         rows = np.concatenate([old.train, old.val])
         if same:
             learned += int(np.isin(fold.test, rows).sum())
         else:
+            # Order and names may differ between two files: rows at one place are taken for the same.
             gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
     what += f" ({before.name})" * same
@@ -217,10 +225,12 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
     try:
         if data.site.sha256 != site.sha256:
             data = datamodule(_settings("dataset", stored[0], None), trusted=False).measurements
+            # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None
             data = aligned(data, site)
         before = _folds(split_for(_settings("split", stored[0], None), data), stored)
+    # A file that is gone makes the answer unknown, which is said; it is no reason to refuse.
     except (ValueError, OSError):
         return None
     return None if trained_on(stored, before) is False else (data, before)
@@ -261,6 +271,7 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     return replace(
         data, site=there, tx=data.tx + shift, rx_position=data.rx_position + shift,
         target=_times(data.target, rescale), uplink=_times(data.uplink, rescale),
+        # Variances are of the square of the unit.
         noise_variance=_times(data.noise_variance, rescale**2),
     )  # fmt: skip
 
@@ -273,7 +284,9 @@ def _about(data: Measurements, site: Site) -> Measurements:
 
     def moved(local: np.ndarray) -> np.ndarray:
         world = local + data.site.origin
+        # Stations may be at unknown places, NaN, which no projection takes.
         known = np.isfinite(world).all(axis=1)
+        # Through degrees: metres about two origins differ by scale and rotation, not by a shift alone.
         world[known, :2] = there.from_degrees(*own.to_degrees(world[known, :2]))
         return world - data.site.origin
 
@@ -305,6 +318,7 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
         if np.isnan(ours.position[t]).any():  # nobody knows where: by the name alone
             near = np.isnan(theirs.position).any(axis=1) & (np.array(theirs.name) == name)
         here = np.flatnonzero(near).tolist()
+        # Sectors of one mast share a place: there the name decides.
         called = [i for i in here if theirs.name[i] == name]
         if len(here) != 1 and not called:
             raise ValueError(f"station {name} of {data.site.name} is none of the model's; leave it out")
@@ -330,6 +344,7 @@ def collect(
     for path in paths:
         run = _unseen(path, dataset, split)
         fold = run.split.folds[0]
+        # Folds and seeds share test rows: a row counts in the evidence once, by the first checkpoint.
         rows = np.setdiff1d(rows_of(fold, "test"), seen)
         if len(rows):
             parts.append(confidence.gather(run.methods[0], run.data, fold, rows))
@@ -350,6 +365,7 @@ def store(
     """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
     evidence = confidence.gather(method, data, fold, rows_of(fold, "test"))
     kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
     threshold = confidence.threshold_of(kind_used, choice)

@@ -21,9 +21,11 @@ SPECTRA = 4  # test rows drawn
 def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:
     """Draw test rows of a fold, which the method was fitted on: `SPECTRA` spectra, else points."""
     spectra = data.site.kind == "spectrum"
+    # Spread over the fold: rows beside each other in a file were measured beside each other.
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     told = list(predictions(method, data, rows))
+    # `predictions` goes station by station: back in the order of rows.
     back = np.argsort(np.concatenate([chosen for chosen, _, _ in told]))
     true = np.concatenate([batch.target.numpy() for _, batch, _ in told])[back]
     predicted = np.concatenate([said.mean.numpy() for _, _, said in told])[back]
@@ -45,14 +47,17 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
     """
     channels = np.iscomplexobj(target)
     figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
+    # The least float32 above 0: a power of 0 has no decibels, and would end the axis at -inf.
     tiny, factor = np.finfo(np.float32).tiny, 20 if channels else 10
     true_db, guess_db = (factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted))
+    # The faintest half percent are outliers of the logarithm; the strongest are what matters.
     low, high = np.percentile(true_db, [0.5, 100])
     what = "channel gain" if channels else "received power"
     axes[0].plot([low, high], [low, high], color="grey", linewidth=1)
     axes[0].scatter(true_db, guess_db, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
     axes[0].set(xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), aspect="equal")
     axes[0].set(xlabel=f"measured {what} [{unit}]", ylabel=f"predicted [{unit}]")
+    # Errors of what lies below the axis would be those of nothing heard.
     heard = np.isfinite(guess_db) & (true_db > low)
     error = np.median(np.abs(guess_db - true_db)[heard]) if heard.any() else np.nan
     axes[0].set_title(f"{what}, median error {error:.1f} dB")
@@ -90,6 +95,7 @@ def draw_spectra(
     for number, (line, true, guess, row) in enumerate(zip(axes, target, predicted, rows, strict=True)):
         power = line[0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
         line[1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
+        # Half of full scale, saturating: at +-1 usual errors of a few hundredths would be white.
         error = line[2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
         line[0].set_yticks(np.arange(30 * np.ceil(edges[2] / 30), edges[3] + 1, 30))
         line[0].set_ylabel(f"row {row}\nelevation [°]")
@@ -127,6 +133,7 @@ def draw_calibration(
     for kind, score in evidence.scores.items():
         risk = risk_coverage(score, loss)
         left.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
+    # Ordered by the errors themselves: no score can be below this curve.
     risk = risk_coverage(-loss, loss)
     left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
     left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")

@@ -35,6 +35,7 @@ def rows_of(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     its `value`, that of Gaussians `alone`, and every figure under its own name; None where a summary has no
     such fact.
     """
+    # Counts of a summary are sums over folds; `measured` is per model.
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
@@ -46,6 +47,7 @@ def rows_of(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     model["alone"] = facts.get(f"field/{shared['figure']}")
     name = str(facts.get("model/name", "?"))
     rows = [shared | model | _of_method(name, under(facts, "test"), under(facts, "time"))]
+    # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
     every = ((name, under(facts, f"baseline/{name}")) for name in beside)
     rows += [dict.fromkeys(own) | shared | _of_method(name, its, its) for name, its in every]
@@ -59,5 +61,5 @@ def _of_method(name: str, figures: Mapping[str, Any], times: Mapping[str, Any]) 
 
 
 def score_db(row: Mapping[str, Any]) -> float:
-    """The figure that places are given by, as decibels of which more are better."""
+    """Return the figure that places are given by, as decibels of which more are better."""
     return score_of(row["figure"], float(row["value"])) + 0.0  # -0.0 would be shown as such

@@ -16,6 +16,7 @@ from gsparc.evaluation.metrics import metrics_for
 from gsparc.models.method import Method, predictions
 
 SUBSETS = ("train", "val", "test")
+# 64 spectra of 90 x 360 pixels take 8 MB in float32, and their targets as much.
 CHUNK = 64  # rows predicted at a time
 FEW = 10  # rows: one of fewer may well be most of the error
 TINY = np.finfo(np.float64).tiny
@@ -48,7 +49,7 @@ class Scores:
         return self.samples["error_db"] ** 2 if self.kind == "rssi" else self.samples["mse"]
 
     def decided_by(self) -> dict[str, Any]:
-        """The row that alone makes more than half of all error or power, and a figure that no row decides.
+        """Return the row that alone makes over half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
         |h|^2; empty where no row weighs so much, there are few, or errors are in decibels.
@@ -58,6 +59,7 @@ class Scores:
         if self.kind == "rssi" or known.sum() < FEW:
             return {}
         error, power, row = error[known], power[known], self.row[known]
+        # A row may decide by its error alone, or by its power, which NMSE divides by.
         shares = np.maximum(error / max(error.sum(), TINY), power / power.sum())
         worst = int(shares.argmax())
         if shares[worst] <= 0.5:
@@ -73,6 +75,7 @@ class Scores:
         """
         error, of_row = self.samples["error_db"], station[self.row]
         known = np.isfinite(error)
+        # Numbered from 0 without gaps: stations without a scored row would be divided by 0.
         error, of_row = error[known], np.unique(of_row[known], return_inverse=True)[1].reshape(-1)
         if not len(error):
             return None
@@ -110,12 +113,13 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     """Numbers (R,) of runs with channels among the rows `eval_on` and none among those learned from."""
     if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
+    # Rows of `val` are not among those learned from where they are the ones scored.
     learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
     return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
 
 
 def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
-    """What predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
+    """Return what predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
 
     A run has a phase of its own, which nothing tells of one that was not learned from.
     """
@@ -123,9 +127,11 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
     for run in runs:
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
         for _, batch, said in predictions(method, data, rows[mine], CHUNK):
+            # complex128: a sum over many rows and entries loses digits in complex64.
             product = (said.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
+            # arg of sum conj(p) t maximises Re sum conj(p e^ja) t over a: the best phase in closed form.
             turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
     return turn
 
@@ -152,6 +158,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     samples = []
     for method, rows, fold in zip(methods, every, split.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
+        # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
         turn = best_phases(method, data, rows, runs) if len(runs) else None
         metric = metrics_for(data.site.scored, data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
@@ -163,6 +170,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
                 if (output := getattr(prediction, name)) is not None:
                     values[chosen] = output.detach().cpu().double().numpy()
             order.append(chosen)
+        # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         samples.append({name: values[back] for name, values in metric.compute().items()})
         confidence.append(outputs["confidence"])

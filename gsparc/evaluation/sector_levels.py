@@ -29,6 +29,7 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
     assert isinstance(trend, Sectors)
     heard = link_rows(data, rows, field.places).loud
     count = np.bincount(heard.station, minlength=len(field.places))
+    # Without an azimuth there is no angle to draw over.
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0
     chosen = [int(t) for t in np.argsort(-count, kind="stable")[:MOST] if count[t] >= LEAST]
     if not chosen:
@@ -41,10 +42,12 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
         rest = torch.from_numpy(heard.of(t).decibels) - trend.mean(at) - trend.loss(at)
         axis.plot(angle, rest, ".", color=PALETTE[0], markersize=3, alpha=0.5)
         turn = np.linspace(-180, 180, 181)
+        # Bearings from north, clockwise: east = sin, north = cos.
         bearing = np.radians(turn + float(trend.table[t, 0]))
         ring = np.median(distance) * np.c_[np.sin(bearing), np.cos(bearing)]
         height = np.full((len(ring), 1), float(at[:, 2].median()))
         around = np.c_[ring + field.places[t, :2], height, np.tile(np.r_[field.places[t], t], (len(ring), 1))]
+        # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.loss(at)).median())
         axis.plot(turn, gain - trend.loss(torch.from_numpy(around)), color=PALETTE[1])
         axis.set(title=f"{data.site.stations.name[t]}, {float(trend.table[t, 0]):.0f} deg", xlim=(-180, 180))
@@ -60,5 +63,6 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
 def _about(places: torch.Tensor, azimuth: float) -> tuple[np.ndarray, np.ndarray]:
     """Angles (n,) from an azimuth [deg] and flat distances (n,) [m] of places (n, 7)."""
     east, north = (places[:, :2] - places[:, 3:5]).numpy().T
+    # Into [-180, 180): the back of the antenna stands at both ends.
     angle = (np.degrees(np.arctan2(east, north)) - azimuth + 180) % 360 - 180
     return angle, np.hypot(east, north)

@@ -17,23 +17,26 @@ from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import shipped
 
+# Materials of ITU-R P.2040 depend on frequency; which one does not matter for drawing.
 CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
-    """From above: received power, delay spread and, after `auto`, where a dropped effect mattered.
+    """Draw from above: received power, delay spread and, after `auto`, where a dropped effect mattered.
 
     Of several transmitters, the strongest at each place.
     """
     changed, survey = outcome.changed, outcome.survey
     count = 2 if changed is None else 3
     places, by_station = survey.places, outcome.dataset.power.reshape(len(survey.engines), -1)
+    # Rows are stations x places: the row of the strongest station at each place.
     best = by_station.argmax(0) * len(places) + np.arange(len(places))
     heard, spread = outcome.dataset.power[best], outcome.dataset.delay_spread[best]
     extent = np.ptp(places[:, :2], axis=0)
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure, (axes,) = panels(5.4 * count, high, 1, count, grid=False)
     reached, triangles = heard > 0, survey.engine.triangles()
+    # A mark's area [points^2] shrinks with the number of places, within what is seen and not hidden.
     size = float(np.clip(6000 / len(places), 2, 40))
     _map(axes[0], places[reached], 10 * np.log10(heard[reached]), "received power [dB]", size)
     _map(axes[1], places[reached], spread[reached] * 1e9, "delay spread [ns]", size)
@@ -41,6 +44,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         known = outcome.dataset.power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
+        # Errors of spectra have no decibels.
         if outcome.choice is not None and not outcome.choice.deliverable.startswith("spectrum"):
             label += " [dB]"
         _map(axes[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
@@ -96,6 +100,7 @@ def effect_shares(choice: Choice, path: Path) -> None:
         axes.barh(names, middle, color=colours, height=0.45)
         axes.set_xlabel(f"{label}: typical (dark), 95 % (light)")
         axes.grid(axis="x", alpha=0.3)
+    # NMSE of kept and dropped effects are decades apart.
     right.set_xscale("log")
     figure.suptitle(f"blue: needed; grey: not. {choice.deliverable}")
     save(figure, path)

@@ -51,6 +51,7 @@ def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     """Places of the moving end (of the receiver where both move), the levels there and what looks wrong."""
     site = data.site
     of_row = data.moving[:, -3:]
+    # np.unique sorts by coordinate; `first` leads back to the order of measuring.
     place, first, which = np.unique(of_row, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)  # as measured: later ones are drawn above
     which = np.argsort(order)[which.reshape(-1)]
@@ -74,6 +75,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     if data.site.kind == "spectrum":
         return None, ""
     power = np.abs(data.target.reshape(len(data), -1)).astype(np.float64)
+    # Targets of powers are linear already, those of channels are amplitudes.
     power = (
         power * data.site.target_scale if data.site.kind == "rssi" else (power * data.site.target_scale) ** 2
     )
@@ -83,6 +85,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     value = power[row, entry]
     if data.site.kind == "rssi":
         value = 10 * np.log10(value)
+    # Powers of channels are averaged linearly, levels of stations in decibels.
     total, number = (np.bincount(which[row], w, minlength=count) for w in (value, None))
     mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
     if data.site.kind == "rssi":
@@ -170,6 +173,7 @@ def _draw_map(
         if (inside & ~known).any():
             silent = places.place[inside & ~known]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
+        # 1 and 99 %: a few outliers would leave one colour for the rest.
         limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
         dots = axis.scatter(
             *places.place[known].T, c=places.level_db[known], s=size, linewidths=0, label=name, **limits
@@ -190,6 +194,7 @@ def _draw_map(
 def _size(place: np.ndarray, extent: float) -> float:
     """Area [points^2] of a mark as large as the distance between neighbours."""
     apart = float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
+    # 72 points are an inch; clipped to what is seen (2.5) and hides no neighbours (9).
     return float(np.clip(72 * INCHES * apart / extent, 2.5, 9.0)) ** 2
 
 
@@ -216,6 +221,7 @@ def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray
         label = f"suspicious level ({len(near)} place{'s' * (len(near) > 1)})"
         axis.scatter(*places.place[near].T, label=label, zorder=3, **marks)
     if len(far):
+        # At the edge, 2 % inside: at its place it would shrink the site to a point.
         edge = np.clip(
             places.place[far], *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1)))
         )
@@ -250,6 +256,7 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
     axis.set_ylim(low, high + 0.2 * (high - low))  # room for words
     for k, step in enumerate(steps):
         last, first = (int(np.searchsorted(rows, row)) for row in (step.last, step.first))
+        # At least one place wide, or a step between neighbours would not be seen.
         axis.axvspan(last, max(first, last + 1), facecolor="red", alpha=0.2)
         axis.axvline(first, color="red", linewidth=1.2)
         note = f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "

@@ -24,6 +24,7 @@ from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 WITH_SILENT = "rmse_db_with_silent"
+# A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -33,6 +34,7 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     Raises:
         ValueError: a value is not a number, a string or None, or is NaN or infinite; the key is named.
     """
+    # Sorted keys: summaries of two runs are compared line by line.
     text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
     with whole_file(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
@@ -42,6 +44,7 @@ def read_summary(path: str | Path) -> dict[str, Any] | None:
     """Return the facts of a summary; None where there is none, or no whole one."""
     try:
         facts = json.loads(Path(path).read_text(encoding="utf-8"))
+    # ValueError: no JSON, as of a file that was cut off.
     except (OSError, ValueError):
         return None
     return facts if isinstance(facts, dict) else None
@@ -63,7 +66,8 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
 
 
 def new_run_id() -> str:
-    """What all files of a run carry, so that those of two are not read together; sorts by time."""
+    """Return what all files of a run carry, so that those of two are not read together; sorts by time."""
+    # 8 digits of a random id: two jobs of a sweep may begin in one second.
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
 
@@ -114,7 +118,7 @@ def result_rows(
 
 
 def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
+    """Return a table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
     result = Table(title=title)
     for column in (*words, *numbers):
         result.add_column(column, justify="left" if column in words else "right")
@@ -132,7 +136,7 @@ def markdown_table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers:
 
 
 def shown(value: float | None, form: str) -> str:
-    """A number in a format, or a dash where there is none or NaN."""
+    """Return a number in a format, or a dash where there is none or NaN."""
     return "-" if value is None or math.isnan(value) else format(value, form)
 
 
@@ -161,6 +165,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
         conditions.append(
             f"SIMULATED stand-in: the {release} release was not found; these figures do not describe it"
         )
+    # A run that was not learned from has a phase that nothing tells: its figure is of another question.
     if facts.get("split/unseen_runs"):
         count = facts["split/unseen_runs"]
         conditions.append(f"{count} runs were not learned from: scored after the best common phase of each")
@@ -178,7 +183,7 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
 
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """The row that alone decides sums over all rows, if one does, and the median beside them."""
+    """Return the row that alone decides sums over all rows, if one does, and the median beside them."""
     row, name, share, median = (
         facts.get(f"{prefix}/decided_by/{key}") for key in ("row", "name", "share", "nmse_median")
     )
@@ -193,7 +198,7 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """The baseline that beats the method, if one does; where rows were silent, these count too."""
+    """Return the baseline that beats the method, if one does; where rows were silent, these count too."""
     figure = WITH_SILENT if f"{prefix}/{WITH_SILENT}" in facts else DECIDING[facts["dataset/kind"]]
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
@@ -207,6 +212,7 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
 def _value(key: str, value: Any) -> int | float | str | None:
     if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:  # NumPy and torch scalars
         value = value.item()
+    # JSON's true is no number to programs that read figures.
     if isinstance(value, bool):
         value = int(value)
     if value is None or isinstance(value, (int, str)):
@@ -238,6 +244,7 @@ def _git() -> str | None:
     if ask("ls-files", "--error-unmatch", here.name) is None:  # an installed copy inside someone else's tree
         return None
     commit = ask("rev-parse", "HEAD")
+    # Untracked files are mostly results of runs: with them every tree would count as edited.
     edited = commit and ask("status", "--porcelain", "--untracked-files=no")
     return f"{commit}-dirty" if edited else commit
 
@@ -245,6 +252,7 @@ def _git() -> str | None:
 def _versions() -> str:
     versions = [f"python {platform.python_version()}"]
     for package in PACKAGES:
+        # Extras may be missing: versions are of what is there.
         with suppress(PackageNotFoundError):
             versions.append(f"{package} {version(package)}")
     return ", ".join(versions)

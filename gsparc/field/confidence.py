@@ -55,22 +55,22 @@ class ErrorModel(nn.Module):
         self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
 
     def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
-        """Variance (B,) of unknown shares (B,), and its share (B,) of what is expected far from all data."""
+        """Return variances (B,) of unknown shares (B,), and their shares (B,) of those far from all data."""
         one = ONE.to(unknown.dtype)
         share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
         return share * self.far, share
 
     def get_extra_state(self) -> Tensor:
-        """For `state_dict`."""
+        """Return what `state_dict` holds beside tensors."""
         return torch.tensor([self.far, self.power], dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """From `state_dict`."""
+        """Read what `state_dict` held beside tensors."""
         self.far, self.power = (float(value) for value in state)
 
 
 def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+    """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
     The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
     line through logarithms would fit the many small errors and miss the few large ones.
@@ -108,7 +108,7 @@ class Confidence(nn.Module):
         self.register_buffer("high", torch.ones(()))
 
     def exponent(self, position: Tensor) -> Tensor:
-        """g (B,), clamped: position (B, 3) [m]."""
+        """Return g (B,), clamped, at positions (B, 3) [m]."""
         g = self.network(self.encoding(position)).squeeze(-1)
         g = g if g.dtype == torch.float64 else g.float()
         return g.clamp(-self.settings.clamp, self.settings.clamp)
@@ -121,7 +121,7 @@ class Confidence(nn.Module):
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
     def normalised(self, position: Tensor) -> Tensor:
-        """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data.
+        """Return the confidence in [0, 1] (B,): C between its least and largest on the calibration data.
 
         It decays outside the box of what was measured, where the network's lines run on unchecked.
         """
@@ -132,7 +132,7 @@ class Confidence(nn.Module):
 
 
 def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
-    """C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
+    """Return C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
 
     log C = log(1 + e^g) is a softplus, finite and with a finite slope for every g.
     """

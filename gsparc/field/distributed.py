@@ -40,7 +40,7 @@ class Processes(DDPStrategy):
 
     @classmethod
     def named(cls, strategy: object) -> Processes | None:
-        """The one that `trainer.strategy` means: of `ddp*`; None of others."""
+        """Return the one that `trainer.strategy` means: of `ddp*`; None of others."""
         if not (isinstance(strategy, str) and strategy.startswith("ddp")):
             return None
         return cls("fork" if "fork" in strategy or "notebook" in strategy else "spawn")
@@ -53,14 +53,14 @@ class Processes(DDPStrategy):
         torch.set_num_threads(max(1, self.threads // self.num_processes))
 
     def configure_ddp(self) -> None:
-        """Nothing is wrapped; all begin with the first process's numbers."""
+        """Wrap nothing; all begin with the first process's numbers."""
         assert self.lightning_module is not None
         for tensor in self.lightning_module.state_dict().values():
             distributed.broadcast(tensor, 0)
 
     @contextmanager
     def block_backward_sync(self) -> Iterator[None]:
-        """While gradients of several batches are added up for one step."""
+        """Hold sums back while gradients of several batches are added up for one step."""
         self._accumulating = True
         try:
             yield
@@ -68,7 +68,7 @@ class Processes(DDPStrategy):
             self._accumulating = False
 
     def post_backward(self, closure_loss: Tensor) -> None:
-        """Before gradients are unscaled, clipped and used."""
+        """Sum gradients, before they are unscaled, clipped and used."""
         if not self._accumulating:
             assert self.lightning_module is not None
             add_up(p for p in self.lightning_module.parameters() if p.requires_grad)
@@ -79,6 +79,7 @@ def add_up(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
     every = list(parameters)
     own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
+    # Sent along: a parameter without a gradient in this process may have one in another.
     has = own[0].new_tensor([p.grad is not None for p in every])
     flat = total(torch.cat([has, *(gradient.flatten() for gradient in own)]))
     sums = flat[len(every) :].split([gradient.numel() for gradient in own])
@@ -87,7 +88,7 @@ def add_up(parameters: Iterable[Tensor]) -> None:
 
 
 def count() -> int:
-    """How many processes train."""
+    """Return how many processes train."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
@@ -97,12 +98,12 @@ def total(values: Tensor) -> Tensor:
 
 
 def largest(values: Tensor) -> Tensor:
-    """Maximum over processes, in place; the values themselves where there is one."""
+    """Return the maximum over processes, in place; the values themselves where there is one."""
     return _reduced(values, ReduceOp.MAX)
 
 
 def agreed(value: float, trainer: L.Trainer) -> float:
-    """The first process's value: clocks differ, and all must decide alike."""
+    """Return the first process's value: clocks differ, and all must decide alike."""
     if not distributed.is_initialized():
         return value
     shared = torch.tensor(value, dtype=torch.float64, device=trainer.strategy.root_device)

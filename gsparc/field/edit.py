@@ -28,7 +28,7 @@ class Edit:
 
 
 def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
-    """Every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
+    """Return every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
     rows = {}
     for name, module in root.named_modules():
         if not getattr(module, "per_gaussian", False):
@@ -57,9 +57,11 @@ def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Opti
         new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]), old.requires_grad)
         _set(root, name, new)
         group = groups.get(id(old))
+        # A parameter that is not learned has no group.
         if optimizer is None or group is None:
             continue
         group["params"][0] = new
+        # Adam's moments are stored by tensor, and must move to the new one.
         state = optimizer.state.pop(old, None)
         if state is not None:
             for key in ("exp_avg", "exp_avg_sq"):
@@ -69,6 +71,7 @@ def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Opti
     fresh = gaussians.next_id + torch.arange(len(edit.parents), device=gaussians.ids.device)
     gaussians.ids = torch.cat([gaussians.ids[edit.keep], fresh])
     gaussians.next_id += len(edit.parents)
+    # Views frozen before are refused from now on (`StalePlan`).
     gaussians.version += 1
 
 

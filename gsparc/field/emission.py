@@ -75,16 +75,17 @@ class Emission(nn.Module):
         self.bias2 = nn.Parameter(torch.full((count, channels), float(settings.init_bias)))
 
     def logits(self, position: Tensor) -> Tensor:
-        """Network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
+        """Return network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
         encoded = self.encoding(position)
         if not self.settings.hidden:
             count, width, channels = self.weight2.shape
+            # Without hidden units all Gaussians read the same features: one product.
             flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
             return (encoded @ flat).view(len(encoded), count, channels) + self.bias2
         return networks(encoded, self.weight1, self.bias1, self.weight2, self.bias2)
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
-        """Emission (B, N, C) at position (B, 3) [m]; distance (B, N) is d_i / d_ref, without unit (eq. 1)."""
+        """Return emissions (B, N, C) at positions (B, 3) [m]; distance (B, N) is d_i / d_ref (eq. 1)."""
         logits = self.logits(position)
         if self.settings.log_distance:
             logits = logits.sub_(distance.log().unsqueeze(-1))
@@ -93,11 +94,12 @@ class Emission(nn.Module):
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
     def inverse(self, emission: Tensor, distance: Tensor) -> Tensor:
-        """The logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
+        """Return the logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
         if self.settings.activation == "linear":
             return emission
         if self.settings.activation == "softplus":
             positive = emission.clamp_min(EMISSION_FLOOR)
+            # log(e^x - 1), without its overflow.
             return positive + torch.log(-torch.expm1(-positive))
         logits = torch.logit(emission.clamp(EMISSION_FLOOR, 1 - EMISSION_FLOOR))
         return logits + distance.log().unsqueeze(-1) if self.settings.log_distance else logits

@@ -116,7 +116,7 @@ class PositionEncoding(nn.Module):
 
 
 def unknown_share(features: Tensor) -> Tensor:
-    """Posterior variance (B,) of a process in [0, 1], of its prior's: `1 - |phi|^2` of features (B, E)."""
+    """Return posterior over prior variance (B,) in [0, 1] of a process: `1 - |phi|^2` of features (B, E)."""
     return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)
 
 

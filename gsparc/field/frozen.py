@@ -35,7 +35,7 @@ class FrozenView:
 
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
-        """Spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
+        """Return spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
 
         Raises:
             StalePlan: the field has changed since.
@@ -74,6 +74,7 @@ class FrozenArray:
             unknown = model.unknown(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
         moving, encoding = model.site.moving(tx, rx), model.emission.encoding
+        # The compiled kernel is float32; float64, for slopes, goes the long way below.
         kernels = moving.dtype == torch.float32 and queries.served(moving, self.weights)
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
@@ -113,6 +114,7 @@ def frozen_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer 
     emission, response, version = model.emission, model.response, int(model.gaussians.version)
     assert isinstance(response, ArrayResponse)
     renderer = renderer or response.renderer
+    # Hidden units and distances make emissions no linear function of features.
     if emission.settings.hidden or model.settings.attenuation.inverse_distance:
         return FrozenArray(version, view, None, None, renderer)
     weight, bias = (torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2))
@@ -130,19 +132,21 @@ def _check_version(version: int, model: GaussianModel) -> None:
 def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
     """A copy with these Gaussians alone, in this order."""
     copy = deepcopy(model)
+    # Kept rows stay in their order: all are appended anew in the plan's instead.
     none = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
     edit.apply(edit.Edit(none, rows), copy, copy.gaussians)
     return copy
 
 
 def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
-    """A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
+    """Return A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
 
     Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that antenna by
     emissions, so that the cost grows with footprints and antennas, not with the square of the Gaussians.
     """
     response, count = model.response, len(model.gaussians)
     assert isinstance(response, ArrayResponse) and model.site.grid is not None
+    # Queries may come in inference mode, in which nothing is differentiated.
     with torch.inference_mode(False), torch.enable_grad():
         field = torch.zeros(1, 2, model.site.grid.height, model.site.grid.width, requires_grad=True)
         parts = torch.view_as_real(response.measured(field)).flatten()

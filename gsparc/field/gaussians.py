@@ -73,12 +73,12 @@ class GaussianField(nn.Module):
         return len(self.means)
 
     def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, quaternions, scales and opacities, as the rasterizer takes them."""
+        """Return means, quaternions, scales and opacities, as the rasterizer takes them."""
         return self.means, self.quats, self.scales, self.opacities
 
     @torch.no_grad()
     def cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
-        """As a picture or a file needs them, with what each emits (N,), in the unit of `label`."""
+        """Return what a picture or a file needs, with what each emits (N,), in the unit of `label`."""
         means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
         quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
         return GaussianCloud(means, scales, quats, opacities, strengths.double().numpy(), label)
@@ -100,7 +100,7 @@ def initial_field(
     receiver: Tensor | None,
     rotation: Tensor | None,
 ) -> GaussianField:
-    """A field before training.
+    """Return a field before training.
 
     Args:
         settings: size and initial state.

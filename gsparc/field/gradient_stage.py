@@ -131,7 +131,7 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
         self.file, self.requested = file, False
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        """Every process that trains is as quiet as the first."""
+        """Make every process that trains as quiet as the first."""
         _quieten_lightning()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:

@@ -85,7 +85,7 @@ class InitTask:
 
 
 def unchanged(model: GaussianModel) -> None:
-    """Random weights stay."""
+    """Leave random weights as they are."""
 
 
 @dataclass(frozen=True)

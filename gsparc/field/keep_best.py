@@ -60,7 +60,7 @@ class KeepBest(L.Callback):
             log.info("gradient steps: %d looks without a sure gain, training ends", self.looks)
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Back to the best; also after a checkpoint with every step done."""
+        """Go back to the best; also after a checkpoint with every step done."""
         if self._kept is None:
             return
         trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
@@ -76,7 +76,7 @@ class KeepBest(L.Callback):
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
-        """What is kept, so that a resumed run ends with it, too."""
+        """Return what is kept, so that a resumed run ends with it, too."""
         counts = {"step": self.step, "looks": self.looks}
         return {"error": self.error, **counts, "start": self.start, "kept": self._kept}
 
@@ -105,5 +105,5 @@ class StopAt(L.Callback):
         self.step = step
 
     def on_train_batch_end(self, trainer: L.Trainer, module: GaussianModule, *unused: Any) -> None:  # type: ignore[override]
-        """After every step."""
+        """End training after the last step, when it was taken."""
         trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step

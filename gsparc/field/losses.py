@@ -101,7 +101,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,).
+    """Return (1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,).
 
     L1 alone for images smaller than SSIM's window, which have no SSIM.
     """
@@ -129,7 +129,7 @@ class LossOf(Protocol):
 
 
 def task_loss(prediction: Tensor, batch: Batch, settings: LossOf) -> Tensor:
-    """Loss (B,) of spectra, channels or powers; what was not measured counts as met.
+    """Return the loss (B,) of spectra, channels or powers; what was not measured counts as met.
 
     Args:
         prediction: like the targets of `batch`.

@@ -57,9 +57,9 @@ class RasterSettings:
     """
 
     projection: Projection = "tangent"
-    low_pass: float = 0.3
+    low_pass: float = 0.3  # [px^2], as in 3D Gaussian splatting (Kerbl et al. 2023)
     compensate: bool = True
-    alpha_cutoff: float = 1 / 255
+    alpha_cutoff: float = 1 / 255  # the least 8-bit step (Kerbl et al. 2023)
     relative_cutoff: float = 1e-3
     backend: str | None = None
 
@@ -141,7 +141,9 @@ class GaussianModel(nn.Module):
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())
         law = settings.attenuation
+        # A static end within 10 cm of the box's middle is no scale of distances.
         self.d_ref = law.d_ref or (apart if apart and apart > 0.1 else 1.0)
+        # Without the law the gain is a parameter all the same, so that state dicts have one shape.
         law = law if law.inverse_distance else AttenuationSettings()
         self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
         self.response = self._response(*(shape or (1, 1)), transmitter)
@@ -173,28 +175,28 @@ class GaussianModel(nn.Module):
 
     @torch.autocast("cpu", enabled=False)
     def unknown(self, tx: Tensor, rx: Pose) -> Tensor | None:
-        """Share f^2 (B,) of the field's variance that is unknown; None where features do not tell."""
+        """Return unknown shares f^2 (B,) of the field's variance; None where features do not tell."""
         if not self.tells_unknown:
             return None
         return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))
 
     @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
     def features(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
+        """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.distances(tx)
         emitted = self.emission(self.site.moving(tx, rx), distance)
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
     def distances(self, tx: Tensor) -> Tensor:
-        """d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
+        """Return d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
         x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))  # a sum over 3 is slow
         # In place: fresh memory of megabytes costs more than the arithmetic.
         square = (x * x).addcmul_(y, y).addcmul_(z, z).add_(self.settings.attenuation.d_min**2)
         return square.mul_(1 / self.d_ref**2).sqrt_()
 
     def attenuation(self, distance: Tensor) -> Tensor | None:
-        """a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
+        """Return a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
         return self.log_gain.exp() / distance if self.settings.attenuation.inverse_distance else None
 
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
@@ -212,11 +214,11 @@ class GaussianModel(nn.Module):
         return Rendered(self.response(weights * gains), None)
 
     def raster(self, features: Tensor, rx: Pose) -> Raster:
-        """Images of features (B, N, C) from one pose, or each from its own of B."""
+        """Return images of features (B, N, C) from one pose, or each from its own of B."""
         return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._optics())
 
     def plan(self, rx: Pose) -> Plan:
-        """Footprints and depth order from one pose, or from each of B."""
+        """Return footprints and depth order from one pose, or from each of B."""
         return ops.make_plan(*self.gaussians.geometry(), rx, **self._optics())
 
     def _optics(self) -> dict[str, Any]:
@@ -233,6 +235,6 @@ class GaussianModel(nn.Module):
         }
 
     def freeze(self, rx: Pose) -> FrozenPlan:
-        """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
+        """Return the pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
             return ops.freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))

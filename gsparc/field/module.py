@@ -77,18 +77,18 @@ class NetworkModule(L.LightningModule):
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
 
     def mean(self, batch: Batch) -> Tensor:
-        """Targets (B, ...) as predicted."""
+        """Return targets (B, ...) as predicted."""
         return self.model(batch.tx, batch.rx)
 
     def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss () of a step on a batch, and the task's of each sample (B,), where these are told apart."""
+        """Return the loss () of a step on a batch, and the task's of each sample (B,) where told apart."""
         # Draws are a pure function of (seed, step): a resumed run goes on with the same.
         draw = torch.Generator().manual_seed(torch.initial_seed() + self.global_step)
         loss = self.model.loss(batch, draw)
         return loss, loss.expand(len(batch))
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
-        """Loss of a batch; one that is not finite ends training."""
+        """Return the loss of a batch; one that is not finite ends training."""
         self.batch = batch
         loss, task = self.losses(batch)
         if not torch.isfinite(loss):
@@ -104,7 +104,7 @@ class NetworkModule(L.LightningModule):
         return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """The rates of the step that was taken, under the names of their settings (`OptimizerSettings`)."""
+        """Log rates of the step that was taken, by names of their settings (`OptimizerSettings`)."""
         if self.global_step % self.log_every == 0:
             groups = self.trainer.optimizers[0].param_groups
             self.log_dict({f"rate/{group['kind']}": group["lr"] for group in groups})
@@ -142,7 +142,7 @@ class NetworkModule(L.LightningModule):
         }
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
-        """Targets (B, ...) in stored units, spectra within [0, 1]."""
+        """Return targets (B, ...) in stored units, spectra within [0, 1]."""
         mean = self.mean(batch)
         return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
 
@@ -153,19 +153,19 @@ class NetworkModule(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
-        """A checkpoint of ours holds a whole model: `NotImplementedError` says what reads it."""
+        """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
         raise NotImplementedError(
             "a checkpoint holds a whole model: say gsparc.models.loading.module_of(FILE)"
         )
 
     def configure_optimizers(self) -> Any:
-        """One Adam group per tensor, rates as pure functions of the step."""
+        """Return one Adam group per tensor, rates as pure functions of the step."""
         optimizer = optimizer_for(self.model, self.rates, self.rate_of)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A poisoned state never replaces a good checkpoint."""
+        """Refuse a poisoned state, which must never replace a good checkpoint."""
         if self._offender() is not None and self.batch is not None:
             raise self._stop(self.batch, int(self.batch.index[0]))
 
@@ -231,7 +231,7 @@ class GaussianModule(NetworkModule):
         return weighted(task, exponent, confidence.settings.alpha).mean(), task
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Loss per sample (B,) before confidence; what was not measured counts as met."""
+        """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
         return task_loss(prediction, batch, self.loss)
 
     def _render(self, batch: Batch) -> Rendered:
@@ -256,7 +256,7 @@ class GaussianModule(NetworkModule):
 
 
 def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:
-    """Squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
+    """Return the squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
     target = batch.target
     if kind == "rssi":
         error = 10 * (mean.clamp_min(1e-30).log10() - target.clamp_min(1e-30).log10())

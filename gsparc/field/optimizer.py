@@ -43,6 +43,7 @@ class OptimizerSettings(Checked):
     decay: float = setting(0.05, RATE)
     warmup: int = setting(0, whole(0))
     solved_share: float = setting(0.01, RATE)
+    # As in 3D Gaussian splatting: gradients of single Gaussians are below Adam's usual 1e-8.
     eps: float = internal(1e-15)
 
     def after_closed_form(self, total: int) -> OptimizerSettings:
@@ -53,7 +54,7 @@ class OptimizerSettings(Checked):
         return replace(self, **shares, warmup=max(self.warmup, round(WARMUP * total)))
 
     def rate_of(self, name: str) -> tuple[str, float]:
-        """Kind and initial rate of a parameter by its dotted name; `KeyError` where none is declared."""
+        """Return a parameter's kind and initial rate by dotted name; `KeyError` where none is declared."""
         kind = kind_of(name)
         return kind, getattr(self, kind)
 
@@ -71,7 +72,7 @@ KINDS = {
 
 
 def kind_of(name: str) -> str:
-    """Which rate a parameter follows, from its dotted name; `KeyError` when none is declared for it."""
+    """Return which rate a parameter follows, by dotted name; `KeyError` where none is declared."""
     for prefix, kind in KINDS.items():
         if name == prefix or name.startswith(prefix + "."):
             return kind
@@ -81,7 +82,7 @@ def kind_of(name: str) -> str:
 
 
 def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf | None = None) -> Adam:
-    """Adam with one parameter tensor per group, so that surgery can exchange single tensors.
+    """Return Adam with one parameter tensor per group, so that surgery can exchange single tensors.
 
     Args:
         model: what is trained.
@@ -97,10 +98,12 @@ def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf
 
 
 def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -> float:
-    """Rate at `step` as a share of the initial one."""
+    """Return the rate at `step` as a share of the initial one."""
     progress = min(step / max(total, 1), 1.0)
+    # From one share, as a first step of rate 0 would be lost.
     rise = min((step + 1) / settings.warmup, 1.0) if settings.warmup else 1.0
     if kind == "positions":
+        # Means that are held have no ratio of rates.
         if settings.positions == 0:
             return 0.0
         return rise * (settings.positions_final / settings.positions) ** progress
@@ -108,7 +111,7 @@ def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -
 
 
 def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> LambdaLR:
-    """The schedule of every group over `total` steps."""
+    """Return the schedule of every group over `total` steps."""
 
     def factor(kind: str):
         return lambda step: rate_factor(kind, settings, step, total)

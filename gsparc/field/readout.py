@@ -54,6 +54,7 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
     trial = copy.deepcopy(model)
     edit.apply(change, trial, trial.gaussians)
     view = _view(trial, batch.rx)
+    # float64: eigenvalues of footprints that overlap are lost in float32's rounding.
     gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
     ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
     missing = (rendered - _lines(trial) @ view) @ view.mH

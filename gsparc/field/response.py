@@ -73,7 +73,7 @@ class ChannelResponse(nn.Module):
         self.delays = nn.Parameter(turns.float(), requires_grad=subcarriers > 1)
 
     def forward(self, weighted: Tensor) -> Tensor:
-        """Visible gains (B, N) complex -> channels (B, A, K) complex."""
+        """Return channels (B, A, K) complex of visible gains (B, N) complex."""
         gains = torch.view_as_real(weighted)
         delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
         if self.even:
@@ -112,7 +112,7 @@ class ArrayResponse(nn.Module):
         self.renderer = SpectrumRenderer(self.array, self.grid, self.wavelength, no_background)
 
     def measured(self, image: Tensor) -> Tensor:
-        """Array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
+        """Return array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
         waves = torch.complex(image[:, 0], image[:, 1])
         return array_output(waves, self.matrix, self.grid, self.pattern)
 
@@ -126,11 +126,11 @@ class ArrayResponse(nn.Module):
         self.renderer.square.copy_(image.square())
 
     def every(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
-        """The renderer on `grid`, every `stride`-th row and column of its own."""
+        """Return the renderer on `grid`, every `stride`-th row and column of its own."""
         return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
 
     def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
-        """Published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if there are any.
+        """Return published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if any.
 
         Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no
         maximum of 1 to be divided by.
@@ -145,5 +145,5 @@ class ArrayResponse(nn.Module):
         return normalised(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
 
     def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
-        """Composited fields (B, 2, H, W) and unknown shares (B,) -> spectra (B, H, W)."""
+        """Return spectra (B, H, W) of composited fields (B, 2, H, W) and unknown shares (B,)."""
         return self.spectra(self.measured(image), unknown)

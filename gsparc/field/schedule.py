@@ -17,7 +17,7 @@ INTERVAL = Limit(
 
 
 def in_steps(given: int | float, total: int) -> int:
-    """The step that `given` means in a training of `total` steps; a share is of one step at least."""
+    """Return the step that `given` means in a training of `total` steps; a share is of one step at least."""
     return given if isinstance(given, int) else max(1, round(given * total))
 
 

@@ -35,12 +35,12 @@ class Budget(L.Callback):
             trainer.should_stop = True
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
-        """Of several processes each has a processor time of its own."""
+        """Count in another process, whose processor time is its own."""
         if os.getpid() != self._process:
             self.budget.moved()
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """What making the Trainer took is no part of the stage; look at the clock."""
+        """Leave out what making the Trainer took, which is no part of the stage; look at the clock."""
         self._begin = self._begin + (self._learned - self._resumed)
         self._look(trainer)
 
@@ -53,7 +53,7 @@ class Budget(L.Callback):
         trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
 
     def state_dict(self) -> dict[str, Any]:
-        """Seconds spent, so that a resumed run has only the rest."""
+        """Return the seconds spent, so that a resumed run has only the rest."""
         return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

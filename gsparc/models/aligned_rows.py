@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 NEIGHBOURS = 50  # rows that tell of a row
 AT_ONCE = 4_096  # rows whose weights are solved together: memory
 TREE = 2_000  # rows of the spanning tree; others hang on the nearest of these
-ROUNDS, SWEEPS = 6, 10
+ROUNDS, SWEEPS = 6, 10  # of settings and factors in turn; of all factors in a round
 WAVE_SWEEPS = 40
 WAVE_NOISE = 0.1  # of the signal's power
 ANTENNAS = 4  # with one factor, from which on only phases of waves fit all
@@ -79,6 +79,7 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
+            # Where gains are free rows have no level of their own: all are learned at unit power.
             level = np.maximum(_rms(rows.values), 1e-30)[rows.moment]
             factors = factors / level[:, None, None]
             if noise is not None:
@@ -93,31 +94,39 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
         len(known), words(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
-    train, val = (averaged(data, target, rows) for rows in (fold.train, fold.val))
     turned = replace(
         data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
     )
+    train, turned = averaged(turned, fold.train)
+    val, turned = averaged(turned, fold.val)
     result = turned, Fold(train, val, fold.test)
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
 
 
-def averaged(data: Measurements, target: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the first of `rows` at each place and station, whose `target` (S, A, K) becomes their mean."""
+def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
+    """Return the first of `rows` at each place and station, and measurements where these are the means."""
     if not len(rows):
-        return rows
+        return rows, data
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-    _, first, packet = np.unique(
-        np.c_[data.moving[rows], station], axis=0, return_index=True, return_inverse=True
-    )
+    _, first, packet, count = np.unique(
+        np.c_[data.moving[rows], station],
+        axis=0, return_index=True, return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    first, packet, target = rows[first], packet.reshape(-1), np.array(data.target)
     measured = np.ones_like(target[rows], bool) if data.mask is None else data.mask[rows]
-    packet = packet.reshape(-1)
-    total = np.zeros((len(first), *target.shape[1:]), target.dtype)
-    count = np.zeros(total.shape)
+    total, several = np.zeros((2, len(first), *target.shape[1:]), target.dtype)
     np.add.at(total, packet, np.where(measured, target[rows], 0))
-    np.add.at(count, packet, measured)
-    target[rows[first]] = total / np.maximum(count, 1)
-    return np.sort(rows[first])
+    np.add.at(several, packet, measured)
+    target[first] = total / np.maximum(several.real, 1)
+    mask, noise = data.mask, data.noise_variance
+    if mask is not None:
+        mask = np.array(mask)
+        mask[first] = several.real > 0  # an entry that any of the packets measured
+    if noise is not None:
+        noise = np.array(noise)
+        noise[first] /= count.reshape(-1, *[1] * (noise.ndim - 1))
+    return np.sort(first), replace(data, target=target, mask=mask, noise_variance=noise)
 
 
 def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
@@ -130,7 +139,7 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Of what was measured in rows (n, A, K), (n,)."""
+    """Root mean square (n,) of what was measured in rows (n, A, K)."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
     return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
 
@@ -140,8 +149,11 @@ _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measuremen
 
 
 def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
-    """The better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    if len(rows.values) == 1:  # a row alone has no other to be turned to
+        return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
+    # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
         values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
@@ -169,6 +181,7 @@ class _Rows:
         values = self.values if direct is None else self.values * direct.conj()
         factors = np.ones((len(values), len(self.tones)), np.complex128)
         trunk = covering(self.places, TREE, 0)
+        # A distance of 0 would be no edge, and several rows may lie at one place.
         tree = minimum_spanning_tree(cdist(self.places[trunk], self.places[trunk]) + 1e-12)
         order, before = breadth_first_order(tree, 0, directed=False)
         child, parent = trunk[order[1:]], trunk[before[order[1:]]]
@@ -187,7 +200,7 @@ class _Rows:
         return "phase" if self.freedom == "phase" else "phase+delay"
 
     def smooth(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by a process of two lengths; of its rounds the one that tells rows best."""
+        """Go on from these factors by a process of two lengths; return the round that tells rows best."""
         kernel, found = first_kernel(self.length, spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
@@ -197,7 +210,8 @@ class _Rows:
         return min(found, key=lambda each: each.error)
 
     def waves(self, factors: np.ndarray) -> Alignment:
-        """From these factors on, by waves from everywhere alike."""
+        """Go on from these factors by waves from everywhere alike."""
+        # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
         weights = self._weights(Kernel((waves,), WAVE_NOISE))
         factors = self._swept(factors, weights, WAVE_SWEEPS)

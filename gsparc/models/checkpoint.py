@@ -253,7 +253,7 @@ def _overgrown(content: Any) -> bool:
 
 
 def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
-    """Where the first number is that is NaN or, unless it may be `infinite`, infinite; None: all are good."""
+    """Return where the first NaN is, or infinity unless it may be `infinite`; None: all are finite."""
     if isinstance(value, Tensor):
         wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
         return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None

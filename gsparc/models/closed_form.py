@@ -79,16 +79,17 @@ class ClosedForm(Method):
 
 
 def stored(method: ClosedForm) -> dict[str, Any]:
-    """What `restored` reads."""
+    """Return what `restored` reads."""
     return {"target": import_path(method.stored_as), "state": method.state()}
 
 
 def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
-    """The method whose `stored` state this was.
+    """Return the method whose `stored` state this was.
 
     Raises:
         ValueError: it names what is no such method of gsparc or a plugin.
     """
+    # The class is named by a file: only gsparc's and plugins' are imported.
     refuse_foreign(state["target"])
     kind = find(state["target"])
     if not issubclass(kind, ClosedForm):

@@ -34,7 +34,7 @@ class LearnsTogether(MethodFactory):
     init: InitSettings
 
     def shares(self, site: Site) -> bool:
-        """Received powers, and channels of a known carrier with its phases."""
+        """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
 
@@ -48,7 +48,7 @@ class LearnsTogether(MethodFactory):
 
 
 def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
-    """How stations of a site that can be learned as one are best learned, and why.
+    """Return how stations of a site that can be learned as one are best learned, and why.
 
     Channels share waves and where their stations really stand: together. Powers share little more than a
     law, so that folds cut as the test was cut decide, between processes without Gaussians.
@@ -65,11 +65,15 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
         return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
     budget = context.time_budget()
     errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
+    # Two folds at least are cut, though one may be looked at: a single one would test all rows.
     for inner in cut_inside(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
         learned = heard(data, np.union1d(inner.train, inner.val))
+        # Rows below or above a level have no value to be wrong by.
         queries = inner.test[data.side(inner.test) == 0]
         if len(learned) > most:
+            # Drawn from all stations at once: each keeps its share of the rows.
             learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:most])
+        # Trial fits leave no files, and go on from none.
         own = replace(context, run_dir=Path(), resume=None, budget_s=budget.left_s)
         parts = list(_by_station(data, learned, queries, own))
         if not parts:
@@ -84,6 +88,7 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
             break
     if not errors:
         return "together", "too few rows of each station to leave any out"
+    # Over rows of all folds, which differ in size.
     together, each = (float(torch.cat(part).mean().sqrt()) for part in zip(*errors, strict=True))
     why = f"rmse {together:.2f} dB together, {each:.2f} dB each, of rows left out as the test is"
     return ("together" if together <= each else "each"), f"{why} ({len(errors)} folds)"

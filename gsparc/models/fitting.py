@@ -66,6 +66,7 @@ def fit(
             start from (`init_from`), and the method has none.
     """
     budget = TimeBudget()
+    # Before the method is made, as another may be called for once rows share a phase.
     (data, rows), left = with_common_phase(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
@@ -73,6 +74,7 @@ def fit(
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             return _restored(factory, data, fold, context, left / checkpoint.MODEL)
+        # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
@@ -88,14 +90,14 @@ def fit(
 
 
 def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
-    """For the `extra` of a finished part's checkpoint: what `fit` compares, and the report."""
+    """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.of(data, fold, context).marks()}
 
 
 def folder_of(path: Path, parts: str) -> Path:
-    """The folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
+    """Return the folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
     inside = path if path.is_dir() else path.parent
     if any(re.fullmatch(parts, one.name) for one in inside.glob("*")):
         return inside
@@ -115,7 +117,7 @@ def _restored(
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:
-    """Their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
+    """Return their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
     result = Counter(method.label for method in methods)
     if not result:
         return name
@@ -144,13 +146,13 @@ class Origin:
 
     @classmethod
     def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
-        """Of a fit that begins."""
+        """Return the origin of a fit that begins."""
         directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
         auxiliary = content_hash({**directions, "uplink": data.uplink})
         return cls(data.site, auxiliary, indices_hash((fold,)), context.seed, context.config_yaml)
 
     def marks(self) -> dict[str, Any]:
-        """For the `extra` of a checkpoint, which holds the configuration itself."""
+        """Return what a checkpoint has as `extra`; it holds the configuration itself."""
         return {"origin": {**self._hashes(), "seed": self.seed}}
 
     def _hashes(self) -> dict[str, str]:
@@ -192,6 +194,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
         return []
     one, two = dict(leaves(before)), dict(leaves(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
+    # `model.refit` lies under `model`, and may change all the same.
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 

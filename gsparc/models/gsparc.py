@@ -40,8 +40,10 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         count, falls = model.field.count, model.attenuation.inverse_distance
         terms = called_for(switches, init, data, model.emission.hidden, count, falls)
         plain, hides = switches.residual is not False, switches.visibility
+        # No Gaussians means the residual alone, where that is not switched off.
         placed = count > 0 or not plain
         residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
+        # The first that is called for: phases relative to neighbours leave no source to be placed.
         table: tuple[tuple[bool, type[Method]], ...] = (
             (site.phase_reference == "neighbours", Channels),
             (terms.power, Powers),
@@ -114,5 +116,6 @@ class Gsparc(LearnsTogether):
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:
             raise ValueError(f"model=gsparc makes no {target}: train again")
+        # `ArrayProcess` sets it again.
         images = replace(self.rendered.settings.response, array=False)
         return rendered[target](plain=self.rendered.plain, **{**self._field, "response": images})

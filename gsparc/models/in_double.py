@@ -15,7 +15,7 @@ DOUBLE = {torch.float32: torch.float64, torch.complex64: torch.complex128}
 
 
 def in_double(part: T) -> T:
-    """A copy of anything that pickles, its tensors constants in float64 or complex128.
+    """Return a copy of anything that pickles, its tensors constants in float64 or complex128.
 
     What is of these types already, and arrays of NumPy, are shared and not copied.
     """

@@ -39,30 +39,31 @@ class LeftOut:
     predicted: np.ndarray
 
     def state(self) -> dict[str, Tensor]:
-        """For the checkpoint of a training that may be interrupted."""
+        """Return what the checkpoint of a training that may be interrupted stores."""
         return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in vars(self).items()}
 
     @classmethod
     def of(cls, state: Mapping[str, Tensor] | None) -> LeftOut | None:
-        """From `state()`; None from None."""
+        """Return what had this `state()`; None of None."""
         return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
     def by_process(self) -> np.ndarray:
-        """The same samples (g, c, P) as a Gaussian process on images predicts them from what is left."""
+        """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
+        # Left singular vectors times singular values are scores in an orthonormal basis.
         kernel = choose_kernel(self.positions, vectors * lengths, len(mean))
         inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
         return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
     def at(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predictions and targets (n, P) at one gap, of the samples that anything is left for."""
+        """Return predictions and targets (n, P) at one gap, of the samples that anything is left for."""
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]
 
     def as_far_as(self, distance: float | None) -> int:
-        """The gap whose held-out samples are most nearly `distance` [m] from what is left, by medians.
+        """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.
 
         Args:
             distance: of rows held out of the fit to the nearest row in it; None: no gap at all.
@@ -70,9 +71,11 @@ class LeftOut:
         if distance is None:
             return 0
         apart = cdist(self.positions[self.centres], self.positions)
+        # A row is not its own neighbour.
         apart[np.arange(len(apart)), self.centres] = np.inf
         beyond = [np.where(apart > gap, apart, np.inf).min(1) for gap in self.gaps]
         medians = np.array([np.median(nearest) for nearest in beyond])
+        # By ratio: twice as far and half as far are equally wrong.
         return int(np.argmin(np.abs(np.log(medians + 1e-9) - np.log(distance + 1e-9))))
 
 
@@ -100,6 +103,7 @@ def predict_left_out(
     for g, gap in enumerate(gaps):
         near = distance[centres] <= gap
         near[np.arange(len(centres)), centres] = True
+        # Rows with all others inside the gap have nothing to be predicted from: they stay NaN.
         some = np.flatnonzero(~near.all(1))
         result = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
         mean[g, some], variance[g, some] = values[centres[some]] - result[0].numpy(), result[1].numpy()

@@ -16,13 +16,14 @@ from gsparc.models.splat.method import LearnedField
 
 
 def restore(stored: checkpoint.Stored) -> Method:
-    """The fitted method a checkpoint holds; only classes of gsparc are built.
+    """Return the fitted method a checkpoint holds; only classes of gsparc are built.
 
     Raises:
         CheckpointError: unknown method, or a state that does not fit it.
     """
     model = stored.configuration.get("model")
     try:
+        # Of `gsparc` the file names the method that was made, its configuration who made it.
         makers = stored.target, import_path(Gsparc)
         if isinstance(model, dict) and model.get("_target_") in makers:
             factory = build(model, trusted=False)
@@ -52,7 +53,7 @@ def made_again(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
 
 
 def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
-    """`restore(read(path))`, with what else the file holds.
+    """Return `restore(read(path))`, with what else the file holds.
 
     Raises:
         CheckpointError: as these two.
@@ -62,7 +63,7 @@ def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
 
 
 def module_of(path: str | Path) -> GaussianModule:
-    """The LightningModule of a `model.ckpt` or `last.ckpt` whose method is a splatted field, on the CPU.
+    """Return the LightningModule in a `model.ckpt` or `last.ckpt` of a splatted field, on the CPU.
 
     Raises:
         CheckpointError: unreadable, or another method's.

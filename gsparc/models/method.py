@@ -100,7 +100,7 @@ class MethodFactory(ABC):
     def best_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
-        """How several stations are best learned, and why, one line; "" where nothing was to be decided."""
+        """Return how several stations are best learned, and why, one line; "" if nothing was to decide."""
         return "each", ""
 
 
@@ -161,7 +161,7 @@ class Method(MethodFactory):
         """
 
     def gradient_problem(self) -> str | None:
-        """Why predictions have no gradients by position; None where they have.
+        """Return why predictions have no gradients by position; None where they have.
 
         Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what moves, for
         mean, variance and confidence, in double precision. What float32 positions get is not changed by it.
@@ -170,22 +170,22 @@ class Method(MethodFactory):
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Tensors, numbers and strings that `restore` needs (weights-only unpickling must accept them)."""
+        """Return tensors, numbers and strings that `restore` needs, as weights-only unpickling accepts."""
 
     @abstractmethod
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the method whose `state()` this was."""
 
     def size(self) -> int:
-        """Number of Gaussians, sources or stored training samples."""
+        """Return the number of Gaussians, sources or stored training samples."""
         return 0
 
     def objects(self) -> SiteObjects:
-        """What it found to stand in the site."""
+        """Return what it found to stand in the site."""
         return SiteObjects.of()
 
     def facts(self) -> dict[str, float | int | str | None]:
-        """What `summary.json` says of a fitted model, None where it means nothing here."""
+        """Return what `summary.json` says of a fitted model, None where it means nothing here."""
         return {
             "model/num_gaussians": self.size() if self.has_gaussians else None,
             "model/class": type(self).__name__,
@@ -231,7 +231,7 @@ def predictions(
 
 @contextmanager
 def suited_threads(method: Method, places: int) -> Iterator[None]:
-    """As many CPU threads as suit a query: one for a single place, where parts of it are too small to share.
+    """Run with as many CPU threads as suit a query: one for a single place, whose parts are small.
 
     On a busy machine two threads that wait for each other take up to a hundred times as long.
     """
@@ -251,7 +251,7 @@ class Reconditions(Protocol):
     """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """A method of rows (n,) alone; None where more than settings would remember the others."""
+        """Return a method of rows (n,) alone; None where more than settings would remember the others."""
 
 
 @runtime_checkable
@@ -259,7 +259,7 @@ class HasProcess(Protocol):
     """A Gaussian process on powers says what it does not know."""
 
     def process(self) -> PowerProcess | None:
-        """The process; None where what was fitted has none."""
+        """Return the process; None where what was fitted has none."""
 
 
 @runtime_checkable
@@ -276,7 +276,7 @@ class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
+        """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
 
         Raises:
             ValueError: what was fitted here has none.
@@ -288,7 +288,7 @@ class HasGaussians(Protocol):
     """What it renders are Gaussians in space."""
 
     def gaussians(self, query: Query) -> GaussianCloud:
-        """All of them, with what they emit: the root mean square over these queries.
+        """Return all of them, with what they emit: the root mean square over these queries.
 
         Raises:
             ValueError: what was fitted here has none.
@@ -300,10 +300,10 @@ class Reducible(Protocol):
     """Answers faster and less accurately when asked to."""
 
     def knobs(self) -> tuple[str, ...]:
-        """Names of the settings that mean something to what was fitted."""
+        """Return names of the settings that mean something to what was fitted."""
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """What must be known of training rows (n,) to reduce it; stored with the model."""
+        """Return what must be known of training rows (n,) to reduce it; stored with the model."""
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
-        """A method that answers with these settings; this one is left as it is."""
+        """Return a method that answers with these settings; this one is left as it is."""

@@ -44,7 +44,7 @@ class Point:
     difference: tuple[float | None, float | None] = field(default=(None, None))
 
     def value(self, figure: str) -> float:
-        """A figure; `ValueError` when these rows do not define it."""
+        """Return a figure; `ValueError` when these rows do not define it."""
         result = self.figures[figure]
         if result is None:
             raise ValueError(f"{figure} is not defined on these rows")
@@ -62,13 +62,13 @@ class Point:
 
 
 def worded(settings: Settings) -> str:
-    """`25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
+    """Return `25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
     words = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
     return ", ".join(word for word in words if word) or "as trained"
 
 
 def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
-    """Indices of the points that no other beats, fastest first.
+    """Return indices of the points that no other beats, fastest first.
 
     A point is on the front if every point at most as slow is less accurate than it (ties: the first wins).
 
@@ -76,6 +76,7 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
         latency: (n,) [ms].
         score: (n,) larger is better.
     """
+    # Of equal latencies the most accurate first: it then beats the others.
     order = sorted(range(len(latency)), key=lambda i: (latency[i], -score[i]))
     best: list[int] = []
     for i in order:
@@ -85,7 +86,7 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
 
 
 def cost_of_halving(latency: Iterable[float], score: Iterable[float]) -> float | None:
-    """What each halving of the latency costs along a front, its least-squares slope [score per halving].
+    """Return what each halving of the latency costs along a front, by least squares [score per halving].
 
     Args:
         latency, score: of the front's points.

@@ -8,6 +8,7 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
@@ -54,16 +55,17 @@ def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
 
 
 def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Stations (T,) bool with training rows enough for `method`, and those of test rows without."""
+    """Return stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
+    # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard(data, fold.train)
     known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
     return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
 
 
 def of_station(site: Site, number: int) -> Site:
-    """The site as one station sees it; of `UNHEARD`, with both ends moving.
+    """Return the site as one station sees it; of `UNHEARD`, with both ends moving.
 
     Its hash is its own, so that nothing kept of one station is taken for another's.
     """
@@ -130,23 +132,27 @@ class PerStation(Method):
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
+        # In other processes stations run side by side: each may take all of the seconds.
         local = not elsewhere()
 
         def fitted(turn: int) -> tuple[Method, FitReport]:
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if left is None else left / folder
+            # The run's `datamodule` loads rows of all stations: a station's fit makes loaders of its own.
             own = context.within(
                 folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
             )
             if len(numbers) > 1:
                 log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
             rows, part = self._part(data, number)
+            # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before = budget.counted.wall
             try:
                 copy, report = fitting.fit(self.factory, part, inner, own)
             except KeyboardInterrupt:
+                # A single station's own message already names the file to go on from.
                 if not resumable or len(numbers) == 1:
                     raise
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
@@ -179,6 +185,7 @@ class PerStation(Method):
         assert stations is not None
         how = context.stations
         if how == "auto":
+            # What trial fits read of the settings is not yet heeded by the fit itself.
             with heeded.apart():
                 how, why = self.factory.best_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
@@ -219,6 +226,7 @@ class PerStation(Method):
             if len(chosen) < LEAST_ROWS:
                 continue
             learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            # One copy that cannot, and the whole would answer from rows that were to be forgotten.
             if learned is None:
                 return None
             result._copies[number] = learned
@@ -233,6 +241,7 @@ class PerStation(Method):
         for number in stations.unique().tolist():
             chosen, copy = (stations == number).nonzero()[:, 0], self.of(number)
             answers.append((chosen, copy.predict(_seen_by(copy.site, query.rows(chosen)))))
+        # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
         return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
 
@@ -241,7 +250,7 @@ class PerStation(Method):
         return next(filter(None, (copy.gradient_problem() for copy in self._copies.values())), None)
 
     def of(self, number: int) -> Method:
-        """The copy that answers for a station.
+        """Return the copy that answers for a station.
 
         Raises:
             ValueError: it had too few training rows, and there is no copy for such stations.
@@ -254,7 +263,7 @@ class PerStation(Method):
         return OfStation(copy, number) if self._shared else copy
 
     def every(self) -> OfStations | None:
-        """One that answers each place for all stations at once (B, T); None: each has a copy of its own."""
+        """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
         return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
@@ -265,10 +274,12 @@ class PerStation(Method):
     def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
+        # One pose may stand for all rows.
         receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3)
         ends = query.tx if self.site.static_end == "tx" else receiver
         table = torch.from_numpy(self.site.stations.position)
-        distance = torch.cdist(ends.detach().cpu().double(), table)
+        # A station at an unknown place is nearest to none: NaN would be the least of every row.
+        distance = torch.cdist(ends.detach().cpu().double(), table).nan_to_num(math.inf)
         apart, number = distance.min(dim=1)
         shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
         if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
@@ -281,7 +292,7 @@ class PerStation(Method):
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
 
     def state(self) -> dict[str, Any]:
-        """Class and state of every copy, by its station's number."""
+        """Return the class and state of every copy, by its station's number."""
         copies = {
             str(number): {"target": import_path(copy.stored_as), "state": copy.state()}
             for number, copy in self._copies.items()
@@ -296,17 +307,17 @@ class PerStation(Method):
             copy.restore(self._site_of(site, int(number)), part["state"])
 
     def objects(self) -> SiteObjects:
-        """Those of all copies: what stands in a site stands there for all its stations."""
+        """Return those of all copies: what stands in a site stands there for all its stations."""
         return reduce(
             SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
         )
 
     def size(self) -> int:
-        """That of all copies."""
+        """Return that of all copies."""
         return sum(copy.size() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
-        """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
+        """Sum over copies what counts or costs, and average shares; initialisers of all are named."""
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()
@@ -324,7 +335,7 @@ class OfStation(View):
         self.number = number
 
     def gradient_problem(self) -> str | None:
-        """That of all stations."""
+        """Return that of all stations."""
         return self.inner.gradient_problem()
 
     def predict(self, query: Query) -> Prediction:
@@ -340,7 +351,7 @@ class OfStations(OfStation):
         self.count = count
 
     def joint(self) -> HasJoint | None:
-        """What knows how levels of stations go together; None where nothing does."""
+        """Return what knows how levels of stations go together; None where nothing does."""
         method = getattr(self.inner, "only", None)
         return method if isinstance(method, HasJoint) else None
 
@@ -360,6 +371,7 @@ def _over(values: list[Any], name: str) -> float | int | str | None:
         return None
     if isinstance(known[0], str):
         return ", ".join(dict.fromkeys(known))
+    # Shares are averaged; counts and seconds of the copies add up.
     return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
@@ -368,5 +380,6 @@ def _seen_by(site: Site | None, query: Query) -> Query:
     assert site is not None
     if site.stations is not None:
         return query
+    # One pose instead of B equal ones: what depends on the receiver alone is computed once.
     still = site.static_end == "rx" and query.rx.batched
     return replace(query, rx=query.rx[0] if still else query.rx, station=None)

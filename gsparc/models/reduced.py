@@ -26,17 +26,17 @@ Measured = dict[str, Tensor]
 
 
 def knobs(method: Method) -> tuple[str, ...]:
-    """Names of the settings that mean something to a method; none where it is not `Reducible`."""
+    """Return names of the settings that mean something to a method; none where it is not `Reducible`."""
     return method.knobs() if isinstance(method, Reducible) else ()
 
 
 def contributions(method: Method, data: Measurements, rows: np.ndarray) -> Measured:
-    """What must be known of training rows (n,) to reduce a method; stored with the model."""
+    """Return what must be known of training rows (n,) to reduce a method; stored with the model."""
     return method.contributions(data, rows) if isinstance(method, Reducible) else {}
 
 
 def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
-    """The method with `settings`; itself when there are none."""
+    """Return the method with `settings`; itself when there are none."""
     return method.reduced(settings, measured) if settings and isinstance(method, Reducible) else method
 
 
@@ -64,7 +64,7 @@ class ReducedByPart(Method):
 def combinations(
     method: Method, grid: Mapping[str, Sequence[Any] | None], singles: Mapping[str, Sequence[Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Settings: none, each of `singles` alone, and every combination in `grid`, of the knobs the method has.
+    """Yield settings: none, each of `singles` alone, all combinations in `grid`, of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.
     """
@@ -74,6 +74,7 @@ def combinations(
     if "stride" in axes:
         axes["stride"] = _dividing(axes["stride"], method)
     together = [
+        # A setting as trained changes nothing: dropped, so that equal combinations are seen to be equal.
         {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
         for chosen in product(*axes.values())
     ]
@@ -92,6 +93,7 @@ def _dividing(strides: Sequence[int], method: Method) -> list[int]:
     if len(fitting) < len(strides):
         none = ", ".join(str(stride) for stride in strides if stride not in fitting)
         log.warning("stride=%s: does not divide the %d columns of the grid, left out", none, grid.width)
+    # An empty axis would leave no combination at all.
     return fitting or [1]
 
 
@@ -114,17 +116,18 @@ class View(Method):
         return "what answers faster does so in float32; load the whole model"
 
     def size(self) -> int:
-        """As the inner method's."""
+        """Return the inner method's."""
         return self.inner.size()
 
     def objects(self) -> SiteObjects:
-        """As the inner method's."""
+        """Return the inner method's."""
         return self.inner.objects()
 
     def fit(self, *unused: Any, **named: Any) -> NoReturn:
         """Refused: `TypeError`."""
         raise TypeError("a view of a trained method is neither trained nor stored")
 
+    # Refused as well: what is stored is the whole method.
     state = restore = fit
 
 
@@ -147,7 +150,7 @@ class MeanOnly(View):
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
-    """Every `stride`-th pixel of the grid, the first row and column among them.
+    """Return every `stride`-th pixel of the grid, the first row and column among them.
 
     Raises:
         ValueError: the columns cannot be divided so.
@@ -175,6 +178,7 @@ class Filled(View):
         self._height = grid.height
         self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
         self._next = torch.arange(1, width + 1)
+        # Across the seam of a full circle the first column follows the last.
         self._next[-1] = 0 if grid.periodic else width - 1
         self._between = torch.arange(stride) / stride
 
@@ -185,11 +189,13 @@ class Filled(View):
         return Prediction(self.fill(result.mean), result.variance, result.unknown)
 
     def fill(self, image: Tensor) -> Tensor:
-        """(B, h, w) -> (B, H, W)."""
+        """Fill images (B, h, w) up to (B, H, W)."""
         beside = image.index_select(2, self._next)
+        # (B, h, w, stride): flattened, the pixels filled in stand between their two columns.
         wide = torch.lerp(image[..., None], beside[..., None], self._between).flatten(2)
         below = wide.index_select(1, self._below)
         tall = torch.lerp(wide[:, :, None], below[:, :, None], self._between[:, None])
+        # A height that the stride does not divide ends within the last step.
         return tall.flatten(1, 2)[:, : self._height]
 
 
@@ -217,12 +223,12 @@ class Blended(View):
 
 
 def mean_alone(process: Method, settings: Settings | None = None) -> Method:
-    """The process without its variance, which costs most of its answer and which the field has of its own."""
+    """Return the process without its variance, most of its cost, which the field has of its own."""
     return reduced(process, {"confidence": False, **(settings or {})}, {})
 
 
 def averaged(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
-    """A reduced field averaged with as many pixels of the process.
+    """Return a reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
 

@@ -65,7 +65,7 @@ def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds:
 
 
 def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:
-    """Posterior means of errors (P, 3) [m], and what errors of this size gain in log density [nats].
+    """Return posterior means of errors (P, 3) [m], and what errors of this size gain [nats].
 
     Args:
         seen: n rows.
@@ -73,6 +73,7 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
         std: (P,) [m]; of a place without error, the displacement is 0.
     """
     weight, count = 1 / seen.variance, len(std)
+    # Errors in units of their own deviation: d / s ~ N(0, 1).
     slope = seen.slope * std[place][:, None, None]
     own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, weight)
     size = torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, place, own)
@@ -83,15 +84,18 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
     for share in SHARES:
         precision = torch.eye(3, dtype=torch.float64) + size / share
         unit = torch.linalg.solve(precision, pull[..., None])[..., 0] / share
+        # Negative log density of N(m, c v), as if places had no errors.
         exact = (whole / share + entries * math.log(share)) / 2
+        # What integrating over d adds, by the matrix inversion and determinant lemmas.
         fit = float((pull * unit).sum()) / share - float(precision.logdet().sum())
         tried.append((exact - fit / 2, exact, unit))
     least, _, unit = min(tried, key=lambda each: each[0])
+    # Without errors c is chosen too: a better scale of variances is no gain of theirs.
     return unit * std[:, None], min(exact for _, exact, _ in tried) - least
 
 
 def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
-    """Rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
+    """Return rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
         field: conditioned on these rows at the places of `data`, channels or powers of one moving end.
@@ -135,9 +139,11 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
     assert result.variance is not None
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":
+        # From linear powers to decibels, to first order.
         variance = variance * (10 / math.log(10) / left.mean.flatten().double().clamp_min(1e-30)).square()
     residual = real(comparable(batch.target, site)) - real(comparable(left.mean, site))
     parts = 2 if batch.target.is_complex() else 1
+    # Half of a circular variance is in either part.
     spread = (variance / parts)[:, None].expand_as(residual)
     if batch.mask is not None:
         spread = torch.where(batch.mask.flatten(1).repeat_interleave(parts, 1), spread, math.inf)
@@ -147,7 +153,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
 
 
 def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
-    """The moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
+    """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
     name = "tx" if data.site.moving_end == "tx" else "rx_position"
     moved = getattr(data, name).copy()
     moved[rows] += by

@@ -22,19 +22,19 @@ if TYPE_CHECKING:  # brings torch, which a list of choices does not need
 
 @cache
 def methods() -> dict[str, str]:
-    """Import paths of the methods of `conf/model`, by name."""
+    """Return import paths of the methods of `conf/model`, by name."""
     files = (file for file in resources.files("gsparc.conf").joinpath("model").iterdir() if file.is_file())
     nodes = {file.name: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
     return {name.removesuffix(".yaml"): nodes[name]["_target_"] for name in sorted(nodes)}
 
 
 def known() -> dict[str, str]:
-    """Import paths of all methods by name: `methods()` and what plugins bring."""
+    """Return import paths of all methods by name: `methods()` and what plugins bring."""
     return plugins("model") | methods()
 
 
 def method_class(name: str) -> type[MethodFactory]:
-    """What makes the method called `name`; `ValueError` with the nearest right name when there is none."""
+    """Return what makes the method `name`; `ValueError` with the nearest right name if there is none."""
     if name in methods():  # before plugins, whose entry points take milliseconds to read
         return get_class(methods()[name])
     there = known()
@@ -44,7 +44,7 @@ def method_class(name: str) -> type[MethodFactory]:
 
 
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
-    """The method that a config of the group `model` describes (unfitted), or what chooses it.
+    """Return the method that a config of the group `model` describes (unfitted), or what chooses it.
 
     Args:
         config: `_target_` and its arguments.

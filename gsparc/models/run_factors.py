@@ -16,8 +16,8 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Prediction
 
-SWEEPS = 200
-SETTLED = 1e-9
+SWEEPS = 200  # of all factors in turn, at most
+SETTLED = 1e-9  # largest change of a factor, of the largest factor, at which they end
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RunFactors:
 
     @staticmethod
     def none() -> RunFactors:
-        """Of channels that are all in phase."""
+        """Return the factors of channels that are all in phase."""
         return RunFactors(np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128))
 
     @staticmethod
@@ -46,14 +46,14 @@ class RunFactors:
         return len(self.runs)
 
     def of(self, run: Tensor | None) -> Tensor:
-        """Factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
+        """Return factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
         if run is None or len(self) == 1:
             return torch.ones(1, dtype=torch.complex128)
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
     def restored(self, answer: Prediction, run: Tensor | None) -> Prediction:
-        """A prediction for the largest run in the phase and level of rows of runs (B,)."""
+        """Return a prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return answer
         of = self.of(run).to(answer.mean.device)
@@ -63,7 +63,7 @@ class RunFactors:
         return replace(answer, mean=answer.mean * factor, variance=variance, explained=explained)
 
     def aligned(self, data: Measurements) -> Measurements:
-        """The channels in the phase and level of the largest run, as of one run."""
+        """Return the channels in the phase and level of the largest run, as of one run."""
         if data.run is None or len(self) == 1:
             return data
         factor = self.of(torch.from_numpy(data.run)).numpy()
@@ -72,17 +72,17 @@ class RunFactors:
         return replace(data, target=target, noise_variance=noise, run=None)
 
     def state(self) -> dict[str, Tensor]:
-        """What `read` reads."""
+        """Return what `read` reads."""
         return {"runs": torch.from_numpy(self.runs), "factors": self.factors}
 
     @staticmethod
     def read(state: dict[str, Tensor] | None) -> RunFactors:
-        """Inverse of `state`; `none` of None."""
+        """Make what had this `state`; `none` of None."""
         return RunFactors.none() if state is None else RunFactors(state["runs"].numpy(), state["factors"])
 
 
 def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """What rows must be multiplied by to belong to the largest run, (runs,) complex128 of largest likelihood.
+    """Return what rows are multiplied by to belong to the largest run, (runs,) complex128, by likelihood.
 
     Args:
         inverse: (n, n) inverse of the rows' covariance.
@@ -94,13 +94,13 @@ def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.
 
 
 def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
+    """Return M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member
 
 
 def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The factors (runs,) from M (runs, runs), of one process or summed over many, and each run's numbers.
+    """Return factors (runs,) from M (runs, runs), of one process or summed over many, and runs' sizes.
 
     Args:
         size: (runs,) complex numbers measured in each, above 0; the largest has factor 1.
@@ -116,6 +116,7 @@ def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
         for r in range(len(size)):
             others = own[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
+            # Positive root of own x^2 - pull x - power size = 0, the likelihood's slope by a factor's size.
             length = (pull + np.sqrt(pull**2 + 4 * own[r] * power * size[r])) / max(2 * own[r], 1e-300)
             factors[r] = length * (others / pull if pull > 0 else 1.0)
         if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():

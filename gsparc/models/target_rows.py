@@ -16,7 +16,7 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
+    """Return targets of `rows` in stored type and units; unmeasured entries are means of other rows.
 
     Many large ones of a file stay on disk. Rows of which only a level is known (`data.censored`) keep it.
 
@@ -34,7 +34,7 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
 
 
 def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
-    """Stored targets (n, ...) as float32 rows (n, D).
+    """Return stored targets (n, ...) as float32 rows (n, D).
 
     Spectra are rows of pixels in [0, 1], channels real and imaginary parts in linear units, powers decibels.
     """
@@ -48,7 +48,7 @@ def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
 
 
 def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
-    """Float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
+    """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
     if kind == "csi":
         return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
     rows = rows.reshape(len(rows), *shape)
@@ -56,7 +56,7 @@ def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
 
 
 def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
-    """Variance (B,) per real number of `to_real` as expected squared error (B,) per entry of the target.
+    """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry.
 
     Complex entries hold two real numbers; decibels are carried to linear power to first order.
     """
@@ -68,18 +68,18 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
 
 
 def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Those of rows (n,) where something was heard, in their order; a saturated one counts as its level."""
+    """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
     return rows[data.side(rows) <= 0]
 
 
 def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
-    """What a reader must know of a fit to `heard(data, rows)`; nothing where all of rows (n,) were heard."""
+    """Say what a fit to `heard(data, rows)` left out; nothing where all of rows (n,) were heard."""
     side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
 
 def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
-    """Powers of rows (n,) in decibels, levels where they are censored."""
+    """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
     return Rows(data.moving[rows], decibels, data.side(rows))

@@ -62,7 +62,7 @@ class Terms:
 def called_for(
     switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
 ) -> Terms:
-    """The terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
+    """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
 
     `distant`: whether emissions fall with the distance, which makes them no linear read-out of an array.
 
@@ -83,6 +83,7 @@ def called_for(
         "phase": no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
+    # Powers always have their process: there the switch means nothing.
     on, reasons, options = {}, [], [] if site.kind == "rssi" else ["model.effects.residual"]
     for name, obstacle in obstacles.items():
         switch = getattr(switches, name)
@@ -135,6 +136,7 @@ def no_array(site: Site, static_end: str, otherwise: str) -> str | None:
         return f"the target is {site.kind}, not a spectrum"
     if site.static_end != static_end:
         return otherwise
+    # One antenna tells no directions, nor does any array without a wavelength.
     if site.array is None or len(site.array) < 2 or site.wavelength is None:
         return "the dataset declares no array or no carrier"
     return None

@@ -55,6 +55,7 @@ def expected_score(prediction: Prediction) -> Tensor | None:
     """Return minus the error variance over the power predicted (B,); None without a variance."""
     if prediction.variance is None:
         return None
+    # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
     return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
@@ -83,6 +84,7 @@ def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
 def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     """Choose the rival process's kernel: length and noise by likelihood on a few known rows."""
     known = np.concatenate([fold.train, fold.val])
+    # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
     return choose_kernel(data.moving[few], parts.scores, len(parts.mean))
@@ -92,6 +94,7 @@ def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> n
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
     white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
+    # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
     return (1 + kernel.noise - white.square().sum(0)).numpy()
 
 
@@ -124,6 +127,7 @@ class Trusted:
         Raises:
             ValueError: the method, or the checkpoint, does not have what `kind` needs.
         """
+        # What is asked for, then what calibration found best, then the method's own.
         kind = kind or self.kind or "learned"
         return as_confidence(kind, self._score(kind, prediction, places)).astype(np.float32)
 

@@ -88,7 +88,8 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [reduced(method, point.settings, measured) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
-    places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
+    ends = 2 if site.static_end is None else 1
+    places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)
     calls = {i: Predictor(way, site).cycling(places) for i, way in enumerate(ways)}
     times = interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}

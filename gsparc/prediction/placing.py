@@ -74,6 +74,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     moving = [end for end in ("tx", "rx") if end in world]
     place = np.hstack([world[end] - site.origin for end in moving])  # type: ignore[index]
     low, high = site.moving_box
+    # Of the longest side: a corridor is so narrow that every place beside it would be far outside.
     margin = MARGIN * float((high - low).max())
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
@@ -96,6 +97,7 @@ def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
 
 def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """Say that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
+    # Places that came in degrees were projected, and have no unit that can be mistaken.
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
     wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in metres), default=0.0)

@@ -277,13 +277,15 @@ class Predictor:
         return stations
 
     def cycling(self, places: np.ndarray) -> Call:
-        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time.
+        """Return calls for a clock: one place (n, 3), or of both ends (n, 6) [m, local], another every time.
 
         Of several stations the first that the model answers for is asked.
         """
         predictor = next(filter(None, self._stations()), self)
         ask = getattr(predictor, self.site.kind)
-        return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
+        ends = ("tx", "rx") if places.shape[1] == 6 else (self.site.moving_end,)
+        world = places.reshape(len(places), -1, 3) + self.site.origin
+        return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
         """Return power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.

@@ -57,6 +57,7 @@ class Learned:
             less = self.method.reconditioned(self.data, known)
             if less is not None:
                 return less
+        # Nobody goes on from this fit: its checkpoints and curves go with the folder.
         with tempfile.TemporaryDirectory() as folder:
             context = replace(self.context, run_dir=Path(folder), split=split or self.context.split)
             return self.refit(fold, context)
@@ -65,6 +66,7 @@ class Learned:
         """Return a fold without test rows of stations that too few training rows are left of."""
         if not isinstance(self.method, PerStation):
             return fold
+        # A station that was fitted on all rows may have too few of them in a fold.
         known, _ = trained_stations(self.method.factory, self.data, fold)
         assert self.data.station is not None
         return replace(fold, test=fold.test[known[self.data.station[fold.test]]])

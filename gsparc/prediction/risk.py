@@ -22,6 +22,7 @@ from gsparc.data.splits import far_apart
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
+# Thresholds that are tried: more of them resolve finer, but each one may end the search.
 LEVELS = 50
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
@@ -173,8 +174,10 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     _, which = np.unique(group, return_inverse=True)
     counts, wrong = np.bincount(which), np.bincount(which, bad)
     share, groups = wrong.sum() / counts.sum(), len(counts)
+    # One group, or all good or all bad: there is no variance between groups to compare.
     if groups < 2 or share in (0.0, 1.0):
         return 1.0
+    # Kish's ratio estimator: squared deviations of group counts from the common share.
     between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
     # A sample variance of a normal variable, over the true one, is chi squared over its degrees of freedom.
     bound = (groups - 1) / chi2.ppf(1 - SURE_OF_EFFECT, groups - 1)
@@ -183,7 +186,7 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
 
 def _tail(wrong: float, accepted: float, alpha: float) -> float:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
-    # The binomial tail as a regularised incomplete beta function, which takes counts that are not whole.
+    # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
     return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
 
 
@@ -309,12 +312,14 @@ def cells(position: np.ndarray) -> np.ndarray:
     """Number the patch of the plane that each position (n, 3) lies in, (n,); on a plumb line, of it."""
     flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
+    # The largest coordinate of all would lie in a cell beyond the last.
     cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     """Return the confidence of the smallest area under risk-coverage on `rows`."""
+    # Bounded, so that a few fades do not decide which kind is the best.
     loss = bounded(evidence.error[rows])
     return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
 
@@ -340,6 +345,7 @@ def accept(
     score, bad = evidence.scores[used], promise.bad(evidence.error)
     if apart_m > 0:  # neighbours err together and count as one
         calibrate = far_apart(evidence.position, calibrate, apart_m, rng)
+    # Divided at random, accepted positions are independent draws, and their counts are binomial.
     patch = cells(evidence.position)[calibrate] if spatial else None
     threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
     return used, threshold, test, choose_on

@@ -106,7 +106,7 @@ def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
 
 
 def cycling(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key, Call]:
-    """Calls that answer one of `queries` each, another one every time."""
+    """Return calls that answer one of `queries` each, another one every time."""
 
     def call(method: Method) -> Call:
         return lambda turn: answered(method, queries[turn % len(queries)])

@@ -215,12 +215,12 @@ class Kernel:
 
     @property
     def lengths(self) -> tuple[float, ...]:
-        """Of the terms [m]."""
+        """Lengths of the terms [m]."""
         return tuple(float(term.length) for term in self.terms)
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """Of the terms."""
+        """Shares of the terms."""
         return tuple(float(term.share) for term in self.terms)
 
     @property

@@ -72,7 +72,7 @@ class Exact(Posterior):
 
     @cached_property
     def factor(self) -> Factor:
-        """Of the rows' covariance."""
+        """Factor of the rows' covariance."""
         return _factor(self.prior, self.rows, self.extra)
 
     def answer(self, queries: Tensor, exact: bool = False) -> Answer:

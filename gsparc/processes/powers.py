@@ -108,18 +108,18 @@ class PowerProcess:
 
     @property
     def kernel(self) -> Kernel:
-        """Of the prior."""
+        """Kernel of the prior."""
         return self.posterior.prior.kernel
 
     @property
     def trend(self) -> Trend:
-        """Of the prior."""
+        """Trend of the prior."""
         assert self.posterior.prior.trend is not None
         return self.posterior.prior.trend
 
     @property
     def places(self) -> np.ndarray:
-        """Of the rows (n, 3) or (n, 6) [m]."""
+        """Places of the rows (n, 3) or (n, 6) [m]."""
         return self.posterior.places.numpy()
 
     def answer(self, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:

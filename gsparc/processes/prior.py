@@ -43,6 +43,7 @@ class Prior:
 
     def variance(self, columns: Tensor) -> Tensor:
         """Return the variance of a measurement (n,) at places of terms (n, Q)."""
+        # Weights of columns have unit variance, and so has the kernel.
         return columns.square().sum(1) + (1 + self.kernel.noise)
 
     def state(self) -> dict[str, Any]:
@@ -79,7 +80,7 @@ class Posterior(ABC):
     @property
     @abstractmethod
     def places(self) -> Tensor:
-        """Of the rows (n, D) float64 [m]."""
+        """Places of the rows (n, D) float64 [m]."""
 
     @abstractmethod
     def answer(self, queries: Tensor, exact: bool = False) -> Answer:

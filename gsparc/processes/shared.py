@@ -41,6 +41,7 @@ class Block:
     def of(cls, process: Exact, columns: Tensor) -> Block:
         """Whiten a process with shared columns (n, P), in units of the values, at its rows."""
         deviation = deviation_of(process.prior)
+        # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whitened(columns) / deviation, values)
 
@@ -87,6 +88,7 @@ class Shared:
         mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for asked, at in self._asked(number):
             prior, more, white, shared = self._said(queries[at], asked, own[at], columns[at], not exact)
+            # -1 stands where a process is asked less often than another of the batch.
             there = at >= 0
             at = at[there]
             spread = prior.kernel.amplitude * prior.variance(own[at])
@@ -106,6 +108,7 @@ class Shared:
         terms, kernel = own.unflatten(0, groups), prior.kernel
         left = kernel.between(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
+        # Rows take variance away; weights that are not fully known give some back.
         for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
             each = root.unflatten(0, groups)
             left = left + sign * each @ each.mT
@@ -173,6 +176,7 @@ class Shared:
         """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
         block = self.block(number)
         root = block.process.factor.root / deviation_of(block.process.prior)
+        # Diagonal of `L^-T (1 - V C V^T) L^-1`, C the covariance of the weights (Woodbury).
         known = self.factor.whitened((root.T @ block.columns).T).square().sum(0)
         rest = block.values - block.columns @ self.mean
         return left_out(root.square().sum(0) - known, root.T @ rest)

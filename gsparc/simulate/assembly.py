@@ -110,6 +110,7 @@ def assemble(
     if choice is not None:
         about["auto"] = json.dumps(asdict(choice))
     data = write_own(shards.out, arrays, {**about, **shards.signature, "simulate_s": seconds})
+    # Not before: until the file is there, the shards are all that there is.
     shards.remove()
     return Assembled(data, power, whole["delay_spread"], facts)
 
@@ -145,6 +146,7 @@ def _arrays(
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
     if campaign.spectrum.normalisation == "none":
         for part in blocks(spectrum):
+            # A shard knew the largest value of its own rows: here all are divided by that of all.
             spectrum[part] = np.round(spectrum[part] * (peak[part] / peak.max())[:, None, None])
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
     tests = max(1, round(scene.test_share * len(order)))
@@ -165,6 +167,7 @@ def _arrays(
     if effects.noise_snr_db is not None:
         power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in blocks(csi)) / csi.size
         variance = power / 10 ** (effects.noise_snr_db / 10)
+        # Another stream than the split's, so that noise does not follow what is held out.
         rng = np.random.default_rng(scene.seed + 1)
         for component in (csi.real, csi.imag):  # all of the one, then all of the other
             for part in blocks(csi):

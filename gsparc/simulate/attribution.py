@@ -160,6 +160,7 @@ class Probe:
 
     def errors(self, remaining: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
         """Return the deliverable's error at each receiver (R,), in the unit of its tolerance."""
+        # Losing everything is infinite in decibels, and would spoil every quantile.
         least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
             return np.abs(10 * np.log10(np.maximum(1 - self.shares(remaining), least)))

@@ -108,6 +108,7 @@ class Traced:
 
     def timed(self, choice: Choice) -> Choice:
         """Return the choice with CPU seconds of a row, and of compiling, which the first part does."""
+        # One part alone does not tell compiling from tracing.
         if len(self._parts) < 2:
             return replace(choice, row_all=None, compiling=None)
         first = len(self._parts[0])
@@ -143,6 +144,7 @@ class Decider:
     def decide(self) -> Decision:
         """Measure probes, decide, verify."""
         begin, both = time.perf_counter(), np.concatenate([self.probes, self.held_back])
+        # A call costs the same full or not, as kernels are compiled for its number of receivers.
         size = self.campaign.sampling.part if self.survey.engine.random else 1
         traced = Traced(self.survey, self.full, both, size)
         choice, changed = self._choose(traced), None
@@ -154,6 +156,7 @@ class Decider:
             if choice.verdict is not None and not choice.verdict.kept:
                 log.info("auto: verification on held-back receivers failed; everything is simulated")
                 choice = auto.everything(choice, self.full)
+        # After the effects, as fewer rays are tried with those that were chosen.
         if self.settings.rays < 1 and self.survey.engine.random:
             choice, changed = self._fewer_rays(traced, choice, changed)
         choice = traced.timed(choice)

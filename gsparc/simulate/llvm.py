@@ -70,6 +70,7 @@ def fault(library: Path) -> str | None:
         return None
     environment = {**os.environ, VARIABLE: str(library)}
     solve = [sys.executable, "-c", TINY_SOLVE]
+    # The first solve compiles, which takes minutes where the machine is busy.
     tried = subprocess.run(solve, env=environment, capture_output=True, text=True, timeout=300)
     lines = tried.stderr.strip().splitlines() or ["no message"]
     # The line that names LLVM says most; else the last one.
@@ -108,6 +109,7 @@ def prepare(fetch_missing: bool = False) -> Path:
             os.environ[VARIABLE] = str(library)
             return library
         faults.append(f"{library}: {wrong}")
+    # A library that the user names is tried alone: another would hide that it is wrong.
     if fetch_missing and not os.environ.get(VARIABLE):
         fetch()
         return prepare()

@@ -187,6 +187,7 @@ class RayTracer(Engine):
         self.retried += 1
         if limit < LARGEST_BUFFER:
             log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
+            # Kept by effects: later batches begin with the buffer that this one needed.
             self._buffer_factor[effects] = boost * 4
             yield from self._batch(receivers, effects, seed)
             return
@@ -302,6 +303,7 @@ class RayTracer(Engine):
         """
         import mitsuba as mi
 
+        # From a metre above everything, so that rays start outside of all objects.
         top = self.box()[1, 2] + 1.0
         above = np.column_stack([across, np.full(len(across), top)])
         hit = self._hit(above, np.array([0.0, 0.0, -1.0]))
@@ -320,6 +322,7 @@ class RayTracer(Engine):
         level = {}  # area of each object that is mostly level
         for name, corners in self._objects().items():
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            # Cross products are twice the areas; their vertical parts are areas seen from above.
             size = float(np.abs(normal[:, 2]).sum())
             if size > GROUND_LEVEL * np.linalg.norm(normal, axis=1).sum():
                 level[name] = size
@@ -375,6 +378,7 @@ def _collect(solution: Any, receivers: int, ports: int) -> Paths:
     edge = np.zeros(len(owner), dtype=bool)
     if buffer.diffracting_wedges is not None:
         wedges = buffer.diffracting_wedges
+        # A free edge has the same triangle on both sides.
         edge = wedges.prim0.numpy() == wedges.primn.numpy()
     kinds = np.where(edge[:, None] & (kinds == DIFFRACTION), EDGE, kinds).astype(np.uint8)
     mechanisms = np.bitwise_or.reduce(kinds, axis=1) if kinds.shape[1] else np.zeros(len(owner), np.uint8)

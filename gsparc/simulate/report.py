@@ -67,6 +67,7 @@ def figures(outcome: Outcome) -> dict[str, Any]:
         "effects": str(outcome.effects),
         **{f"scene/{name}": value for name, value in dataset.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
+        # A resumed run that found all shards has traced nothing, in no time.
         "time/receivers_per_s": len(outcome.survey) / max(outcome.seconds["trace"], 1e-9),
     }
     if outcome.convergence is not None:

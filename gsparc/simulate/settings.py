@@ -42,6 +42,7 @@ class Campaign:
 
     def inputs(self) -> dict[str, str]:
         """Return the SHA-256 of the files that a scene and its receivers are read from."""
+        # By their contents, so that an edited map does not go on with the shards of the old one.
         files = (self.scene.file, self.scene.xml, (self.scene.receivers or {}).get("file"))
         return {
             str(file): hashlib.sha256(Path(file).read_bytes()).hexdigest()
@@ -54,5 +55,6 @@ class Campaign:
             raise ValueError(f"measurement={self.measurement}: expected spectrum or csi")
         if self.shard < 1 or self.check < 0:
             raise ValueError("shard is at least 1, check at least 0")
+        # The same seed gives the same rays, and a convergence error of 0.
         if self.check_seed == self.sampling.seed:
             raise ValueError("check_seed must differ from sampling.seed")

@@ -57,6 +57,7 @@ class Room:
         >>> Room.uniform((6.0, 4.0, 3.0)).contains(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]))
         array([ True, False])
         """
+        # The room is open and its boxes are closed: places on a surface are refused.
         inside = np.all((points > self.lower) & (points < self.upper), axis=-1)
         for low, high in self.occluders:
             inside = inside & ~np.all((points >= low) & (points <= high), axis=-1)
@@ -143,6 +144,7 @@ def _meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray
     """Whether segments start -> end (S, 3) meet the box from low to high (3,): (S,) bool; slab test."""
     along = end - start
     parallel = along == 0
+    # Any divisor does: along a parallel axis `outside` decides alone.
     step = np.where(parallel, 1.0, along)
     near, far = (low - start) / step, (high - start) / step
     near, far = np.minimum(near, far), np.maximum(near, far)
@@ -250,6 +252,7 @@ class ShoeboxEngine(Engine):
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
             polarisation=False,
+            # Without reflections only the line of sight is left, which has no bounce.
             depth=effects.depth if effects.specular else 0,
         )
 
@@ -262,6 +265,7 @@ class ShoeboxEngine(Engine):
         owner, image = np.nonzero(seen)
         way = mirrored.of(self.transmitter)[image] - receivers[owner]
         distance = np.linalg.norm(way, axis=-1)
+        # Friis' amplitude between isotropic antennas, without the carrier's phase.
         gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
         order = mirrored.order[image].astype(np.uint8)
         return Paths.of(

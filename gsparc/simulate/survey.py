@@ -75,6 +75,7 @@ class Survey:
     def trace(self, rows: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Trace paths of rows (n,), in their order."""
         owner, place = np.divmod(rows, len(self.places))
+        # Stable: rows of a transmitter stay in the order in which they are traced.
         order = np.argsort(owner, kind="stable")
         parts = [
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)

@@ -106,17 +106,19 @@ class FitContext:
             raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
         if self.stations not in get_args(StationModels):
             raise ValueError(f"stations={self.stations!r}: one of auto, each, together is needed")
+        # `isinstance` would take true for 1.
         if type(self.batch_size) is not int or self.batch_size < 1:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
             )
 
     def within(self, folder: str, **changes: Any) -> FitContext:
-        """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
         if self.loggers:
             from gsparc.training.tracking import Part  # imports Lightning
 
             changes = {"loggers": [Part(one, folder) for one in self.loggers], **changes}
+        # No folder stays none: below an empty path lies the working directory.
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
     def curve(
@@ -124,10 +126,11 @@ class FitContext:
     ) -> None:
         """Add a point to the learning curve, in the folder and the loggers; see `curve.point`."""
         row = curve.point(seconds, what, error, step, **figures)
+        # All rows again: a file that appears by renaming cannot be appended to.
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)
 
     def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
-        """What a fit counts, and the seconds that may end it, some spent before."""
+        """Return what a fit counts, and the seconds that may end it, some spent before."""
         seconds = math.inf if self.budget_s is None else self.budget_s
         return TimeBudget(seconds, self.budget_clock, before, Effort().times(self.effort))

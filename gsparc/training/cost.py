@@ -23,8 +23,9 @@ class Cost:
     unused: Mapping[str, float] = field(default_factory=dict)
 
     def __add__(self, other: Cost) -> Cost:
-        """Of two fits, such as those of two stations."""
+        """Add the stages of two fits, such as those of two stations."""
         stages, unused = (
+            # In the order in which stages came, which a set would lose.
             {name: a.get(name, 0.0) + b.get(name, 0.0) for name in dict.fromkeys([*a, *b])}
             for a, b in ((self.stages, other.stages), (self.unused, other.unused))
         )
@@ -32,16 +33,16 @@ class Cost:
 
     @property
     def seconds(self) -> float:
-        """Of all stages [s]."""
+        """Seconds of all stages [s]."""
         return sum(self.stages.values())
 
     @property
     def unused_s(self) -> float:
-        """Of stages without weight [s]."""
+        """Seconds of stages without weight [s]."""
         return sum(self.unused.values())
 
     def described(self, limited_by: Clock | None) -> str:
-        """One line."""
+        """Return one line."""
         parts = []
         for name, spent in self.stages.items():
             unused = f" ({self.unused[name]:.1f} s unused)" if name in self.unused else ""

@@ -27,6 +27,7 @@ def point(
         step: of gradient training.
         **figures: of `FIGURES`.
     """
+    # What is not finite is not known.
     known = error is not None and math.isfinite(error)
     row = {"seconds": round(seconds, 3), "what": what, "error": error if known else "", "step": step}
     return {name: "" if (row | figures).get(name) is None else (row | figures)[name] for name in COLUMNS}
@@ -36,6 +37,7 @@ def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write all rows of the curve of a run's folder at once; nowhere where there is no folder."""
     if folder == Path():
         return
+    # By renaming: a killed run leaves a whole table.
     with whole_file(folder / FILE) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()

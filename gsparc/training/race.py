@@ -27,23 +27,18 @@ class Race:
         rows: (n,) that it left out.
         squared, energy: (n,) its squared errors, and what the targets measure.
         note: is told of each look at a candidate: what, and its mean squared error per entry.
-        effort: above 1 those behind are given more time, as a mixture of both may still gain.
     """
 
     rows: np.ndarray
     squared: np.ndarray
     energy: np.ndarray
     note: Callable[[str, float], None]
-    effort: float = 1.0
 
     @classmethod
-    def of(
-        cls, rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None],
-        effort: float = 1.0,
-    ) -> Race:  # fmt: skip
-        """A candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
+    def of(cls, rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]) -> Race:
+        """Return a candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
         squared, energy = (rowwise(one) for one in (mean - target, target))
-        return cls(rows, squared, energy, note, effort)
+        return cls(rows, squared, energy, note)
 
     @property
     def error(self) -> float:
@@ -51,7 +46,7 @@ class Race:
         return float(self.squared.sum() / max(self.energy.sum(), 1e-30))
 
     def looked(self, what: str, rows: np.ndarray, squared: np.ndarray, before: float = 0.0) -> float:
-        """The error of another candidate where both left rows out, as a share of their energy.
+        """Return the error of another candidate where both left rows out, as a share of their energy.
 
         Args:
             what: it is, for the learning curve.
@@ -67,8 +62,7 @@ class Race:
         self.note(what, float(squared.mean()))
         apart = squared[there] - missed
         surely = apart.sum() > SURE * apart.std() * math.sqrt(len(apart))
-        patience = max(self.effort, 1.0)
-        if surely and error > max(HOPELESS**patience * least, STALLED ** (1 / patience) * before):
+        if surely and error > max(HOPELESS * least, STALLED * before):
             raise Behind(f"{what} miss {error:.3f} of the energy of rows held out, another {least:.3f}")
         return error
 

@@ -42,7 +42,7 @@ class Effort:
     steps_after_solving: int = 60
 
     def times(self, factor: float) -> Effort:
-        """All of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
+        """Return all of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
         counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
         rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
         return Effort(**{name: max(round(count), 1) for name, count in {**counts, **rows}.items()})
@@ -64,7 +64,7 @@ class Spent:
     processor: float = 0.0
 
     def by(self, clock: Clock) -> float:
-        """[s]"""
+        """Return seconds of the clock [s]."""
         return self.wall if clock == "wall" else self.processor
 
     def __add__(self, other: Spent) -> Spent:
@@ -78,7 +78,7 @@ NOTHING = Spent()
 
 
 def less_repeatable(*clocks: Clock | None) -> Clock | None:
-    """Of clocks that decided something, the one whose seconds repeat a result worst; None of none."""
+    """Of clocks that decided something, return the one whose seconds repeat results worst; None of none."""
     return "wall" if "wall" in clocks else next(filter(None, clocks), None)
 
 
@@ -108,11 +108,12 @@ class TimeBudget:
         self._since: Spent | None = self._now()
 
     def _now(self) -> Spent:
+        # Seconds of threads add up: divided, both clocks agree where all of them work.
         return Spent(time.monotonic(), time.process_time() / self._threads)
 
     @property
     def counted(self) -> Spent:
-        """By both clocks."""
+        """Seconds by both clocks."""
         return self._before if self._since is None else self._before + (self._now() - self._since)
 
     @property
@@ -123,6 +124,7 @@ class TimeBudget:
     @property
     def left_s(self) -> float | None:
         """What is left of it, more than nothing; None without an end [s]."""
+        # Never 0, as a context refuses a budget that is not positive.
         return None if math.isinf(self.seconds) else max(self.seconds - self.spent, 1e-3)
 
     @property
@@ -146,10 +148,12 @@ class TimeBudget:
     def moved(self) -> None:
         """Count on in another process, whose processor time began with it."""
         if self._since is not None:
+            # The wall's clock is the machine's; a new process's own begins at 0.
             self._since = Spent(self._since.wall, 0.0)
 
     def over(self) -> bool:
         """Whether it is spent; whoever asks then ends what it does."""
         result = self.spent > self.seconds
+        # For good: what it ended stays ended, though time may be charged or paused later.
         self.limited |= result
         return result

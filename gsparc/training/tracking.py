@@ -35,7 +35,7 @@ class Part(Logger):
     version = property(lambda self: self.whole.version)
 
     def log_hyperparams(self, *unused: Any, **named: Any) -> None:
-        """Nothing: the run's are said once."""
+        """Log nothing: the run's are said once."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log figures under the part's name."""
@@ -52,7 +52,7 @@ class Part(Logger):
 
 @contextmanager
 def opened(config: DictConfig) -> Iterator[list[Logger]]:
-    """Loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
+    """Yield loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
     made: list[Logger] = []
     settings: Any = OmegaConf.to_container(config, resolve=True)
     status = "failed"
@@ -73,7 +73,7 @@ def opened(config: DictConfig) -> Iterator[list[Logger]]:
 
 
 def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
-    """A logger for `logger=wandb`.
+    """Return a logger for `logger=wandb`.
 
     Args:
         offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done.
@@ -107,7 +107,7 @@ def _of_job() -> dict[str, Any]:
 
 
 def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:
-    """A logger for `logger=tensorboard`; event files go to `save_dir/name`.
+    """Return a logger for `logger=tensorboard`; event files go to `save_dir/name`.
 
     Raises:
         ValueError: TensorBoard is not installed.

@@ -40,10 +40,12 @@ class RayLauncher(Launcher):
         state = Singleton.get_state()
 
         def done(job: DictConfig) -> JobReturn:
+            # A worker is another process: Hydra's resolvers and singletons are not there yet.
             setup_globals()
             Singleton.set_state(state)
             return run_job(task, job, "hydra.sweep.dir", "hydra.sweep.subdir", context)
 
+        # Workers take over this process's number of threads, and count as so many cores.
         torch.set_num_threads(jobs[0].get("threads") or 1)
         executor.use(executor.Engine("ray", self.workers, self.address))
         found = dict(executor.each(done, jobs, "jobs"))

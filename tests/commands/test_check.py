@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gsparc.commands.check import check, main
+from gsparc.commands.check import _value, check, main
 from gsparc.data.load import load
 from gsparc.data.own import write_own
 
@@ -139,3 +139,12 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
     assert "the transmitter, b, at (9.000, 9.000, 0.000) m" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(said)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("./x", "./x"), ("[A,B]", ["A", "B"]), ("-50dBm", "-50dBm"), ("[1, 2e3]", [1, 2000]), ("2.4e9", 2.4e9)],
+)  # fmt: skip
+def test_a_setting_with_dots_or_a_unit_was_a_number(text, value):
+    """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4."""
+    assert _value(text) == value

@@ -5,7 +5,7 @@ from doors import assert_refused, knock
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.data.errors import DataError
-from gsparc.data.files import check_yaml, read_yaml, whole_file, whole_folder
+from gsparc.data.files import _partial, check_yaml, read_yaml, whole_file, whole_folder
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -76,3 +76,12 @@ def test_aliases_that_share_settings_are_read(tmp_path):
     assert read_yaml(tmp_path / "a.yaml", "", "")["c"] == {"x": 1, "y": [2, 3], "z": 4}
     (tmp_path / "b.yaml").write_bytes(b"\xff&*")
     check_yaml(str(tmp_path))
+
+
+def test_a_folder_of_a_killed_process_of_the_same_number_was_in_the_way(tmp_path):
+    left = _partial(tmp_path / "set")
+    left.mkdir()
+    (left / "half").write_text("")
+    with whole_folder(tmp_path / "set") as partial:
+        (partial / "whole").write_text("")
+    assert [one.name for one in (tmp_path / "set").iterdir()] == ["whole"]

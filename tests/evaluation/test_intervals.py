@@ -96,3 +96,12 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
     scores = Scores("rssi", 0 * row, row, {"prediction": mean}, np.full(len(row), np.nan), spread)
     assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db"}
+
+
+def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_decibels(drawn):
+    data = drawn[0]
+    side = np.where(np.arange(COUNT) == 0, -1, data.side(np.arange(COUNT))).astype(np.int8)
+    silent = replace(data, censored=side)
+    one = scored(silent, np.full(COUNT, -np.inf), 6.0)
+    one = replace(one, samples={**one.samples, "error_db": np.zeros(COUNT)})
+    assert with_silent(one, silent)["rmse_db_with_silent"] < 200

@@ -128,3 +128,19 @@ def test_packets_of_one_place_are_averaged(logged):
     mean, own = turned.target[rows.train], own[rows.train]
     missed = own - mean * turning(mean, own, tones, "phase+delay")[:, None]
     assert (np.abs(missed) ** 2).sum() < 0.09 * (np.abs(own) ** 2).sum()  # of one packet .18
+
+
+def test_one_row_of_a_station_has_nothing_to_be_turned_to(logged):
+    """The nearest others of a row alone were an IndexError."""
+    found = align(Snapshots.of(logged, np.arange(1)), "phase+delay", logged.site)
+    assert found.factors.shape == (1, logged.target.shape[2]) and (found.factors == 1).all()
+
+
+def test_what_any_packet_of_a_place_measured_is_known_of_their_mean(logged):
+    several = logged.subset(np.array([0, 0, 1]), logged.site)
+    mask = np.ones(several.target.shape, bool)
+    mask[0, 0, 3] = mask[2, 0, 5] = False
+    noise = np.full(3, 0.2, np.float32)
+    rows, mean = aligned_rows.averaged(replace(several, mask=mask, noise_variance=noise), np.arange(3))
+    assert rows.tolist() == [0, 2] and mean.mask[0].all() and not mean.mask[2, 0, 5]
+    assert mean.noise_variance[rows].tolist() == pytest.approx([0.1, 0.2])

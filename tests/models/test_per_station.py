@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -237,3 +238,14 @@ def test_stations_that_are_fitted_elsewhere_are_the_same_bits(town, fold, tmp_pa
     elsewhere("joblib")
     there = fitted("gp", town, fold, tmp_path / "there")
     assert torch.equal(here.predict(batch).mean, there.predict(batch).mean)
+
+
+def test_a_station_at_an_unknown_place_answered_for_all(town, fold, tmp_path):
+    """The distance to it was NaN, and the least of every row."""
+    method = fitted("mean", town, fold, tmp_path)
+    places = np.array(town.site.stations.position)
+    expected = method._stations(town.batch(fold.test))
+    places[1] = np.nan
+    method.site = replace(town.site, stations=replace(town.site.stations, position=places))
+    rows = fold.test[expected.numpy() != 1]
+    assert (method._stations(town.batch(rows)) == expected[expected != 1]).all()

@@ -69,6 +69,7 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """See the base class; where there are too many, another one is ended."""
         super().connection_made(transport)
+        # Counted from the start, not from the last byte: a byte a second keeps no connection open.
         self.end = self.loop.call_later(self.limits.request_s, transport.abort)
         if len(self.connections) <= self.limits.connections:
             return
@@ -83,7 +84,7 @@ class Connection(H11Protocol):
         other.transport.abort()
 
     def works(self) -> bool:
-        """Whether the answer to a whole request is computed, or written to a client that reads."""
+        """Return whether the answer to a whole request is computed, or written to a client that reads."""
         cycle = self.cycle
         return bool(cycle) and not (cycle.more_body or cycle.response_complete or self.flow.write_paused)
 
@@ -151,8 +152,10 @@ class Batcher:
         """Until cancelled; a request whose client left is dropped."""
         while True:
             await self.some.wait()
+            # A first request waits 2 ms by default: those that come meanwhile share its matrix products.
             await asyncio.sleep(self.delay_s)
             batch = self._next()
+            # In a thread: while the model computes others can connect and be refused.
             for one, found in zip(batch, await asyncio.to_thread(self._answers, batch), strict=True):
                 if not one.answer.done():
                     failed = isinstance(found, Exception)
@@ -162,6 +165,7 @@ class Batcher:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, left = waiting[:1], self.most
+        # By size: a request for a thousand places would otherwise delay many for one.
         for one in sorted(waiting[1:], key=lambda one: one.size):
             left -= one.size
             batch += [one] if left >= 0 else []
@@ -180,11 +184,12 @@ class Batcher:
             parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
+            # One faulty request must not spoil a batch: each is asked again alone, to find whose fault it is.
             return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
 def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
-    """The routes: POST /predict, and /std for its deviations, GET /healthz.
+    """Return the routes: POST /predict, and /std for its deviations, GET /healthz.
 
     Args:
         predictor: of one end that moves and one station.
@@ -196,12 +201,15 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
     """
     site = predictor.site
     middle = getattr(predictor, site.kind)(**{site.moving_end: site.moving_box.mean(0) + site.origin})
+    # Real and imaginary part count as two numbers.
     each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
     if each > limits.numbers:
         raise SettingError(
             f"numbers={limits.numbers}: an answer at one place holds {each}; say {each} or more"
         )
+    # Both limits hold: of places, and of numbers in the answer.
     most = min(limits.most, limits.numbers // each)
+    # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
     routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
     batchers = {
         route: Batcher(predictor, what, limits.delay_ms / 1e3, most) for route, what in routes.items()
@@ -233,10 +241,12 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
     @app.post("/std")
     @app.post("/predict")
     async def predict(request: Request) -> Response:
+        # Media types are compared without case (RFC 9110, 8.3.1).
         body, raw = bytearray(), request.headers.get("content-type", "").lower().startswith(RAW)
         try:
             async for part in request.stream():
                 body += part
+                # A bracket opens each place and one all of them: enough to refuse a body before it is parsed.
                 count = len(body) // PLACE if raw else body.count(b"[") - 1
                 if count > most or len(body) > most * BYTES + MORE:
                     said = f"at most {most} places, {each} numbers each"

@@ -11,10 +11,13 @@ import torch
 from torch import Tensor
 
 Rule = Literal["target", "expected"]
+# 14 symbols of a slot less two of pilots.
 SYMBOLS = 12  # of a slot that carry data
+# 256 positions x 28 MCS x tones are held by Sionna at once.
 CHUNK = 256
 OUTAGE = 0.5  # a transport block that fails more often than this carries nothing worth having
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # of a normal law
+# d(10 log10 |h|^2) = 20 / ln 10 times the relative error, whose real part has half of its power.
 SLOW_DECIBEL = 20 / np.log(10) / np.sqrt(2)  # SINR error [dB] of one flat tone per root of relative error
 
 
@@ -67,6 +70,7 @@ class Band:
     @property
     def expected_power(self) -> Tensor:
         """E |h|^2 (n, K): a mean that was shrunk by its doubt is no estimate of power."""
+        # E|h|^2 = |mean|^2 + variance; |mean|^2 alone would choose too low a rate where doubt is large.
         return self.predicted.abs().square() + self.variance[:, None]
 
 
@@ -92,6 +96,7 @@ class Adaptation:
         self.abstraction = PHYAbstraction()
         self.bler_target = bler_target
         self.subcarriers, self.symbols_per_s = subcarriers, symbols_per_s
+        # 28: table 6.1.4.1-1 of TS 38.214, which Sionna takes for PUSCH; 28 to 31 are for retransmissions.
         order, rate = decode_mcs_index(torch.arange(28), table_index=1, is_pusch=True)
         efficiency = (order.double() * rate.double()).cpu()
         self.full_bps = efficiency * subcarriers * symbols_per_s
@@ -106,9 +111,11 @@ class Adaptation:
             chosen = self._highest(self._fails(guess - care))
             regret = torch.full((len(chosen),), torch.nan, dtype=torch.float64)
         else:
+            # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
             loud = band.expected_power.mean(1).clamp_min(1e-30)
             doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
             chosen, regret = self._carries_most(guess, care * doubt)
+        # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 
         def of(table: Tensor, mcs: Tensor) -> np.ndarray:
@@ -130,6 +137,7 @@ class Adaptation:
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""
         parts = []
+        # Sionna copies the tones for every MCS: positions in parts bound the memory.
         for some in sinr.split(CHUNK):
             tones = some[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
             parts.append(self._of_every_mcs(len(some), sinr=tones)[2][..., 0])
@@ -146,6 +154,7 @@ class Adaptation:
         """The highest MCS (n,) that meets the target; the lowest there is where none does."""
         number = torch.arange(28)
         good = torch.where(fails <= self.bler_target, number, -1).max(1).values
+        # Tables leave out some MCS: the lowest index there is need not be 0.
         lowest = torch.where(fails.isfinite(), number, 28).min(1).values
         return torch.where(good >= 0, good, lowest)
 
@@ -156,6 +165,7 @@ class Adaptation:
         """
         carried = torch.zeros(effective_db.shape, dtype=torch.float64)
         most = torch.zeros(len(effective_db), dtype=torch.float64)
+        # Gauss-Hermite with 9 nodes is exact for polynomials to degree 17 under a normal density.
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
             fails = self._fails(effective_db + node * spread_db[:, None])
             delivered = self.full_bps * (1 - fails.clamp_max(1))

@@ -24,6 +24,7 @@ from gsparc.prediction.risk import Evidence
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World
 
+# 32 positions x antennas x fine tones bound what is held at once.
 CHUNK = 32
 
 
@@ -52,7 +53,7 @@ class Channels:
         return Channels(self.true[at], self.predicted[at], *rest)
 
     def band(self) -> Band:
-        """The first antenna's; what states no variance is taken for exact."""
+        """Return the first antenna's band; what states no variance is taken for exact."""
         return Band(self.true[:, 0], self.predicted[:, 0], self.variance.nan_to_num(0.0))
 
 
@@ -72,11 +73,13 @@ def channels(
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
+        # What separates paths answers at any frequency; others are interpolated between measured tones.
         if isinstance(method, SeparatesPaths) and batch.uplink is not None:
             wanted = torch.from_numpy(frequency_hz)
             answer = method.from_uplink_at(batch.uplink, wanted, batch.noise_variance, antennas)
         else:
             answer = method.predict(batch)
+            # The variance stays that of measured tones: interpolation is smooth between them.
             mean = interpolated(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
             answer = Prediction(mean, answer.variance, answer.unknown)
         none = torch.full((len(batch),), torch.nan)
@@ -116,6 +119,7 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     assert site.carrier_hz is not None
     there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
     heard = uplink[rows].astype(np.complex128) * site.target_scale
+    # Simulated streets know the channel, but each snapshot was turned by its own phase and timing.
     clean = there.response(site.uplink_hz, rows)
     coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)
     # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
@@ -123,8 +127,10 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     away = site.uplink_hz - site.uplink_hz.mean()
     weight = np.abs(rest)
     middle = np.angle(rest.sum(1, keepdims=True))
+    # About the middle phase: deviations then stay within +-pi and need no unwrapping.
     angle = np.angle(rest * np.exp(-1j * middle))
     mean = (weight * away).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
+    # Least squares weighed by power: slope and level of the phase over frequency.
     slope = (weight * (away - mean) * angle).sum(1) / (weight * (away - mean) ** 2).sum(1)
     level = ((weight * angle).sum(1) / weight.sum(1) - slope * mean[:, 0]) + middle[:, 0]
     wanted = there.response(frequency_hz, rows)[:, site.antennas]

@@ -30,6 +30,7 @@ RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),
 }  # fmt: skip
+# Below one error in the 1440 blocks of a point: where 0 errors are drawn.
 LEAST_RATE = 3e-4
 
 
@@ -43,12 +44,14 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
             curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
             bler = curve.bler.clip(LEAST_RATE).to_numpy()
             counts = zip(curve.errors, curve.blocks, strict=True)
+            # Of counts, hence the binomial's own interval: no normal one holds at 0 errors.
             ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
             reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
             axes[0, column].errorbar(curve.index, bler, reach, **style_above)
             axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
         axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
+        # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
         for row, what in enumerate(("block error rate", "bit error rate")):
             axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
@@ -66,6 +69,7 @@ def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) ->
     left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
     left.legend()
     middle = rates[len(rates) // 2]
+    # Misses of three and more are rare: one box for them.
     miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
     groups = {name: score[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
     present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}

@@ -47,12 +47,14 @@ class Pusch:
         config.carrier.subcarrier_spacing = spacing_khz
         config.tb.mcs_table = 1
         config.tb.mcs_index = MODULATIONS[modulation]
+        # A second symbol of pilots a slot: both are averaged against noise.
         config.dmrs.additional_position = 1
         self.transmitter = nr.PUSCHTransmitter(config)
         self.grid = self.transmitter.resource_grid
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
+        # What the receiver assumes of pilots must be what the transmitter sends.
         dmrs = config.dmrs
         shape = dmrs.length, dmrs.additional_position, dmrs.num_cdm_groups_without_data
         estimators: dict[str, Estimator] = {
@@ -92,9 +94,11 @@ class Pusch:
         for start in range(0, len(position), batch):
             rows = position[start : start + batch]
             at = torch.from_numpy(rows)
+            # Each channel to mean power 1: Eb/N0 is then that of every block, not of the median place.
             scale = band.true[at].abs().square().mean(1).sqrt()[:, None]
             self._prior = band.predicted[at] / scale, band.variance[at] / scale[:, 0] ** 2
             there, guess = (self._slots(h[at] / scale) for h in (band.true, band.predicted))
+            # Variance 0 for those that are taken for exact: their receiver trusts the estimate fully.
             exact, doubt = torch.zeros(1), self._prior[1].view(-1, *[1] * 6).expand(there.shape).contiguous()
             self._known = {
                 "perfect": (there, exact), "predicted": (guess, exact), "predicted_variance": (guess, doubt)
@@ -131,6 +135,7 @@ class _Wiener:
         self.symbols = mask.any(1).nonzero().flatten()
         self.comb = (full[self.symbols[0]].abs() > 0).nonzero().flatten()
         self.pilots = full[self.symbols][:, self.comb]
+        # R(-k) = conj R(k): the correlation matrix is Hermitian, and Toeplitz.
         lag = np.arange(mask.shape[1])[:, None] - np.arange(mask.shape[1])
         whole = np.where(lag >= 0, correlation[np.abs(lag)], correlation[np.abs(lag)].conj())
         self.whole = torch.from_numpy(whole).to(torch.complex128)
@@ -138,6 +143,7 @@ class _Wiener:
 
     def __call__(self, y: Tensor, no: Tensor) -> tuple[Tensor, Tensor]:
         heard = y[:, 0, 0][:, self.symbols][:, :, self.comb]
+        # Pilots of both symbols are averaged: the channel stands still over a slot.
         energy = self.pilots.abs().square().sum(0)
         matched = (heard * self.pilots.conj()).sum(1) / energy
         noise = float(torch.as_tensor(no).flatten()[0]) / energy.double()
@@ -152,6 +158,7 @@ class _Wiener:
         filtering = torch.linalg.solve(known.mT, cross.T.expand(len(known), -1, -1)).mT
         news = (matched - mean[:, self.comb]).to(filtering.dtype)
         smooth = mean + (filtering @ news[..., None])[..., 0].to(torch.complex64)
+        # The error's variance, v (R - F C^H), which rounding may take below 0.
         left = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real).clamp_min(0)
         shape = (len(y), 1, 1, 1, 1, y.shape[3], y.shape[4])
         spread = (variance * left).float().view(-1, 1, 1, 1, 1, 1, self.whole.shape[0])
@@ -163,10 +170,12 @@ def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: flo
     """Normalised correlation over frequency at lags 0 to count - 1 of `spacing_hz`, from channels (n, K)."""
     if len(tones_hz) == 1:
         return np.ones(count, complex)
+    # Each channel to power 1, so that strong places do not decide the correlation.
     unit = (channel / channel.abs().square().mean(1, keepdim=True).sqrt().clamp_min(1e-30)).numpy()
     lags = np.arange(len(tones_hz))
     values = np.array([(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags])
     step = float(np.diff(np.sort(tones_hz)).min())
     wanted = np.arange(count) * spacing_hz
     real, imaginary = (np.interp(wanted, lags * step, part) for part in (values.real, values.imag))
+    # By lag 0, where `values` is 1 up to rounding and masked tones.
     return (real + 1j * imaginary) / values[0].real

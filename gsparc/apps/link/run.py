@@ -66,6 +66,7 @@ class LinkStudy:
             1e3 * self.shape["spacing_khz"],
         )
         self.one = slice(self.antenna, self.antenna + 1)
+        # The PUSCH grid around the measured band's middle, whatever tones were measured.
         frequency_hz = centred(float(self.tones.mean()), self.spacing_hz, self.count)
         grid = channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
         evidence, promise = (
@@ -77,6 +78,7 @@ class LinkStudy:
         scores = evidence.scores[kind]
         self.score = scores[self.test]
         self.accepted = self.score >= threshold.value
+        # Rates are tuned on rows set aside from the test, and on those that would be accepted.
         rows = aside[scores[aside] >= threshold.value]
         self.aside = rows if len(rows) else aside
         self.states_variance = bool(grid.variance.isfinite().all())
@@ -95,6 +97,7 @@ class LinkStudy:
         if self.data.target.shape[1] == 1:
             return {}
         every = channels(self.method, self.data, self.fold.test, self.tones)
+        # `test` are numbers into the fold's test rows, as `accepted` are into `test`.
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
         return beam_facts(every.true, every.predicted, accepted)
 
@@ -119,6 +122,7 @@ class LinkStudy:
         if len(receivers) < len(self.receivers):
             missing = ", ".join(r for r in self.receivers if r not in receivers)
             log.warning("%s states no error variance: left out are %s", self.method.name, missing)
+        # Only training rows: the estimator's correlation must not know test channels.
         heard = self.data.targets(self.fold.train)[:, self.antenna]
         known = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
@@ -135,6 +139,7 @@ class LinkStudy:
         facts |= {f"tradeoff/{modulation}/{name}": value for name, value in trade.items()}
         facts |= {
             "pusch/truth": self.grid.source, "pilots/share_of_slot": pusch.pilot_share,
+            # An accepted position needs no pilots at all.
             "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
             f"time/pusch_{modulation}_s": time.perf_counter() - begun,
         }  # fmt: skip

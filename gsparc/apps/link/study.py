@@ -22,10 +22,12 @@ LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 d
 
 
 def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
-    """Where a falling curve over its index first crosses `target`, linear in its logarithm; None: never."""
+    """Return where a curve over its index first falls below `target`, linear in its logarithm, or None."""
+    # No error in all blocks sent: its logarithm is cut at 1e-6.
     x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
     for i in range(len(x) - 1):
         if floor[i] > target >= floor[i + 1]:
+            # Curves fall exponentially: linear in log(rate) between two points.
             share = np.log(floor[i] / target) / np.log(floor[i] / floor[i + 1])
             return float(x[i] + share * (x[i + 1] - x[i]))
     return None
@@ -33,6 +35,7 @@ def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
 
 def gain(true: Tensor, predicted: Tensor) -> Tensor:
     """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
+    # Maximum ratio transmission: the conjugate prediction, normalised per tone.
     weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
     received = (true * weight.conj()).sum(1).abs().square()
     single = true.abs().square().mean(1)
@@ -40,8 +43,9 @@ def gain(true: Tensor, predicted: Tensor) -> Tensor:
 
 
 def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
-    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
+    """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN of silence."""
     best = gain(true, true)
+    # Largest of both: a beam into a null would be infinitely bad.
     return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
 
 
@@ -55,6 +59,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         accepted: which of the n are.
     """
     few = min(8, true.shape[1])
+    # Of the first antennas: a channel silent on these has no 8-antenna beam.
     loud = true[:, :few].abs().amax((1, 2)) > 0
     facts: dict[str, Any] = {"beams/positions": len(true), "beams/silent": int((~loud).sum())}
     true, predicted, accepted = true[loud], predicted[loud], accepted[loud.numpy()]
@@ -93,6 +98,7 @@ def adapt(
     loop = Adaptation(
         float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
     )
+    # Noise by the median of positions with power, so that outages do not lower it.
     median = band.median_power
     if median <= 0:
         raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
@@ -105,6 +111,7 @@ def adapt(
     care = max(delivered, key=lambda c: delivered[c])
 
     def at(noise: float) -> tuple[Rates, Rates]:
+        # A backoff for each noise level is tuned aside, as its best depends on the slope of the tables.
         backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
         target = loop.rates(band, noise, max(backed, key=lambda b: backed[b]))
         return loop.rates(band, noise, care, "expected"), target
@@ -122,7 +129,7 @@ def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray) -> dict[
     facts: dict[str, Any] = {}
     for rule, ones in rates.items():
         for one in ones:
-            stem = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
+            stem = f"mcs/{one.snr_db:g}dB" + ("" if rule == "expected" else f"/{rule}")
             facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted).items()}
     return facts
 
@@ -156,6 +163,7 @@ def _by_regret(one: Rates) -> dict[str, float | None]:
     all positions when the others send pilots. What a rate needs to know is not how large an error is, but
     whether it crosses a step."""
     facts: dict[str, float | None] = {}
+    # Stable, so that equal regrets keep the order of positions in every run.
     order = np.argsort(one.regret_bps, kind="stable")
     for share in np.arange(0.3, 1.01, 0.1):
         calm = np.zeros(len(order), bool)
@@ -179,6 +187,7 @@ def transmit(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, in
     def at(level: float) -> list[pd.DataFrame]:
         few = pusch.run(band, level, order[:coarse], batch)
         rate = few.groupby("receiver").failed.mean()
+        # An error floor of predictions is looked at too, as long as perfect knowledge fails somewhere.
         worst = max(rate["perfect"], rate["predicted"])  # which may have an error floor
         steep = fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]
         return [few, pusch.run(band, level, order[coarse:fine], batch)] if steep else [few]
@@ -227,7 +236,7 @@ def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str,
 def acceptance(
     blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]
 ) -> tuple[float, pd.DataFrame]:
-    """The Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
+    """Return the Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.
 
     Of the surest `shares` of positions by `score` (P,), the index; receivers are the columns.
     """

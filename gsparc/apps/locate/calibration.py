@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import Looked
 
+# Bounds of the search, within which `of` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 160
@@ -19,7 +20,7 @@ LOOKS = 160
 def calibrated(
     snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
 ) -> Trust:
-    """The trust under which places that were held out are most likely, with an area that holds a share.
+    """Return the trust under which held-out places are most likely, with an area that holds a share.
 
     All numbers but the level maximise the mean log density at the true places, a proper score; the level is
     then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
@@ -37,6 +38,7 @@ def calibrated(
     count = 4 if blurred else 3
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS][:count]).T
 
+    # In logarithms: all are positive and known up to factors.
     def of(point: np.ndarray) -> Trust:
         inflation, temperature, tail, *spread = np.exp(np.clip(point, *spans)).tolist()
         return Trust(inflation, temperature, tail, *(edge * one for one in spread))
@@ -48,6 +50,7 @@ def calibrated(
         )
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD][:count])
+    # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(count), np.diag([1.0, -1.5, 1.0, 1.0][:count])])
     optimum = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
@@ -56,7 +59,9 @@ def calibrated(
 
 
 def levelled(trust: Trust, snapshots: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
-    """The trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
+    """Return the trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
     levels = np.sort([one.by(trust).level(place) for one, place in zip(snapshots, places, strict=True)])
+    # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
+    # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
     return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)

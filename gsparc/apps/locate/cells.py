@@ -39,7 +39,7 @@ class Cells:
         return np.where(self.edge > 0, self.edge, 1.0).prod(1)
 
     def at(self, chosen: np.ndarray) -> Cells:
-        """The cells `chosen`."""
+        """Return the cells `chosen`."""
         return Cells(self.centre[chosen], self.edge[chosen])
 
     def halved(self) -> Cells:
@@ -56,7 +56,7 @@ class Cells:
         return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
 
     def holding(self, place: np.ndarray) -> int:
-        """The cell that a place (3,) is in, or that is nearest to it."""
+        """Return the cell that a place (3,) is in, or that is nearest to it."""
         outside = (np.abs(self.centre - place) - self.edge / 2).clip(0) * (self.edge > 0)
         return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
 
@@ -64,7 +64,7 @@ class Cells:
 def cover(
     trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> Cells:
-    """About `most` equal cells of the box of trained places (n, 3) [m].
+    """Return about `most` equal cells of the box of trained places (n, 3) [m].
 
     Args:
         trained, most: places [m, local], and cells of the whole box.
@@ -99,7 +99,7 @@ def cover(
 
 
 def floors(height: np.ndarray) -> np.ndarray:
-    """The median height of the floor that each of heights (n,) [m] is of."""
+    """Return the median height of the floor that each of heights (n,) [m] is of."""
     order = np.argsort(height)
     number = np.empty(len(height), np.int64)
     number[order] = np.cumsum(np.diff(height[order], prepend=height.min()) > STOREY_M)

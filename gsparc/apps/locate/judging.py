@@ -68,7 +68,7 @@ class Localisation:
     facts: dict[str, Any]
 
     def columns(self, inside: Sequence[bool]) -> dict[str, Any]:
-        """Of `locate.csv`, in the world's coordinates [m]."""
+        """Return the columns of `locate.csv`, in the world's coordinates [m]."""
         located = next(iter(self.answers.values()))
         place, true = np.array([one.place for one in located]), self.heard.place
         columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
@@ -128,7 +128,7 @@ def report(
 def by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
 ) -> Localisation:
-    """A trained model locates its test rows, or those of a file.
+    """Locate the test rows of a trained model, or those of a file.
 
     Args:
         config: see conf/locate.yaml.
@@ -142,7 +142,9 @@ def by_model(
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Unknown(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    # What was learned earlier for other settings is refused: its areas would hold another share.
     start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
+    # A plan is in world metres, cells are local.
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
     cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
@@ -187,6 +189,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
         if not placed:  # anywhere: nothing is compared with it
             count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
             low, high = site.moving_box + site.origin
+            # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), site)
         heard = snapshots(other, np.arange(len(other)))
@@ -194,7 +197,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
 
 
 def by_fingerprints(config: DictConfig) -> Localisation:
-    """A field of fingerprints is learned, and rows that it did not learn from are located.
+    """Learn a field of fingerprints, and locate rows that it did not learn from.
 
     Args:
         config: see conf/locate.yaml.
@@ -217,6 +220,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     else:
         known, heard = map(rows.at, parted(rows, how, *cut, seed))
     heard = heard.at(_sample(config, len(heard.level)))
+    # Devices of one building differ by some 6 dB: an offset that is integrated out.
     offset = DEVICES_DB if config.offset_db is None else float(config.offset_db)
     started = time.perf_counter()
     locator = FingerprintLocator.of(known, offset, config.prior == "trained", bool(config.track))
@@ -227,6 +231,7 @@ def by_fingerprints(config: DictConfig) -> Localisation:
     }  # fmt: skip
     promise = "nothing is promised without calibration, or of another campaign"
     if groups:
+        # Held-out rows promise something only of rows drawn as they are.
         random, share = how in ("random", "places", "blocks", "walks"), float(config.share)
         inner: Any = how if random else "places"
         locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
@@ -242,6 +247,7 @@ def _sample(config: DictConfig, count: int) -> np.ndarray:
     """Numbers of at most `rows` of so many rows, drawn evenly."""
     if not count:
         raise ValueError("there is nothing to be located")
+    # Sorted, since rows of a track must stay in the order of time.
     return np.sort(np.random.default_rng(int(config.seed)).permutation(count)[: config.rows])
 
 
@@ -266,6 +272,7 @@ def draw_posteriors(
             Rectangle((x, y), w, h) for (x, y), (w, h) in zip(corners, cells.edge[order, :2], strict=True)
         ]
         patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
+        # 12 below the largest, a factor of 160,000: what is fainter is no different from white.
         patches.set_array(np.maximum(density[order], density.max() - 12))
         axis.add_collection(patches)
         axis.plot(*trained[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
@@ -284,6 +291,7 @@ def draw_errors(errors: Mapping[str, np.ndarray], path: Path) -> None:
     figure, ((axis,),) = panels(6, 4)
     for name, values in errors.items():
         label = f"{name}, median {np.median(values):.3g} m"
+        # .1 mm stands for no error at all on a logarithmic axis.
         axis.ecdf(np.maximum(values, 1e-4), color=look(name).colour, label=label)
     logarithmic(axis)
     axis.set(xlabel="error [m]", ylabel="share of snapshots", ylim=(0, 1))

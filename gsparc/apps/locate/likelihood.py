@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+# 32 MB in float64: blocks of snapshots are made no larger.
 MOST = 4_000_000  # entries of an array (n, P, G) at a time
 TINY = 1e-30
 
@@ -40,11 +41,11 @@ class Misfit:
         return Misfit(squared, size, self.count, silent)
 
     def at(self, places: Tensor) -> Misfit:
-        """At places (g,) by number."""
+        """Return the misfit at places (g,) by number."""
         return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 
     def of(self, snapshot: int) -> Misfit:
-        """Of one snapshot."""
+        """Return the misfit of one snapshot."""
         one = slice(snapshot, snapshot + 1)
         return Misfit(self.squared[one], self.size[one], self.count[one], self.silent[one])
 
@@ -77,21 +78,24 @@ class Trust:
         """(n, G), up to a constant of each snapshot."""
         squared = self.temperature / self.inflation * misfit.squared
         count = self.temperature * misfit.count[:, None]
+        # log1p: for small misfits the logarithm of 1 + x loses the digits of x.
         spread = (self.tail + count) * torch.log1p(squared / self.tail)
         return -0.5 * (spread + self.temperature * misfit.size) + self.temperature * misfit.silent
 
 
 def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
-    """Of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
+    """Return the misfit of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
     spread = variance[:, 0].clamp_min(TINY)
+    # |v - m|^2 as |v|^2 - 2 v m + |m|^2: one matrix product instead of an array (n, G, P).
     squared = values.square().sum(1)[:, None] - 2 * values @ mean.T + mean.square().sum(1)
     size = (values.shape[1] * spread.log()).expand(squared.shape)
     count = torch.full((len(values),), float(values.shape[1]), dtype=values.dtype)
+    # Where both are alike the difference of squares may round below 0.
     return Misfit(squared.clamp_min(0) / spread, size, count, torch.zeros_like(squared))
 
 
 def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: bool) -> Misfit:
-    """Of complex values (n, P), NaN where missing, by means and variances (G, P).
+    """Return the misfit of complex values (n, P), NaN where missing, by means and variances (G, P).
 
     Without a known phase each snapshot is turned to where it fits best.
     """
@@ -99,7 +103,9 @@ def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: boo
     mean, precision, log_variance = _moments(mean, variance)
     power = heard.abs().square() @ precision.T + seen @ (mean.abs().square() * precision).T
     overlap = heard @ (mean.conj() * precision).T
+    # The best phase turns the overlap onto the real axis: its size is what is left of it.
     gain = overlap.real if phase_known else overlap.abs()
+    # Twice: real and imaginary part each have half of a complex variance.
     squared = 2 * (power - 2 * gain).clamp_min(0)
     return Misfit(squared, 2 * seen @ log_variance.T, 2 * seen.sum(1), torch.zeros_like(squared))
 
@@ -107,7 +113,7 @@ def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: boo
 def of_levels(
     values: Tensor, mean: Tensor, variance: Tensor, offset_db: float = 0.0, floor: Tensor | None = None
 ) -> Misfit:
-    """Of powers (n, P) [dB], NaN where missing, by means (G, P) [dB] and variances (G, P) [dB^2].
+    """Return the misfit of powers (n, P) [dB], NaN where missing, by means, variances (G, P) [dB, dB^2].
 
     Args:
         values: what was heard.
@@ -121,6 +127,7 @@ def of_levels(
     weighed = known * precision
     square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (known * weighed).T
     slope = heard @ precision.T - seen @ weighed.T
+    # Sherman and Morrison: (D + o^2 1 1^T)^-1 takes one rank out; its determinant is |D| times this.
     shared = 1 + offset_db**2 * (seen @ precision.T)
     squared = (square - offset_db**2 * slope.square() / shared).clamp_min(0)
     size = seen @ log_variance.T + shared.log()
@@ -129,6 +136,7 @@ def of_levels(
         spread = (variance + offset_db**2).sqrt()
         parts = []
         for block in floor.split(max(MOST // max(mean.numel(), 1), 1)):
+            # log_ndtr, not the logarithm of ndtr, which is -inf from 38 deviations on.
             chance = torch.special.log_ndtr((block[:, None] - mean) / spread)
             counted = ~torch.isnan(block)[:, None] & ~torch.isnan(mean)  # silent, and with a prediction
             parts.append(torch.where(counted, chance, torch.zeros_like(chance)).sum(2))

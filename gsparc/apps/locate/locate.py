@@ -43,6 +43,7 @@ def locate(
     """
     site = predictor.site
     if site.kind == "rssi" and not np.iscomplexobj(values):
+        # By way of stored units: users give levels in the unit that answers come in.
         stored = site.power_unit(unit or predictor.unit).stored(torch.as_tensor(values))
         values = stored * site.target_scale
     heard = of_values(site, values, silent)

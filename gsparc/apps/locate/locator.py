@@ -53,7 +53,7 @@ class Located:
 
     @classmethod
     def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
-        """At a place (3,) [m, local], with the area of cells that hold a mass `level`."""
+        """Return what is known at a place (3,) [m, local], with the area of cells of a mass `level`."""
         area = float(posterior.cells.size[posterior.within(level)].sum())
         return cls(place, area, len(posterior.modes(level)), posterior, seconds)
 
@@ -81,7 +81,7 @@ class Locator:
         cls, predictor: Predictor, trained: np.ndarray, unknown: Unknown, trust: Trust,
         cells: Callable[[np.ndarray], Cells], share: float,
     ) -> Self:  # fmt: skip
-        """Of a model that was trained at places (n, 3) [m, local], with `cells` by these.
+        """Return the locator of a model that was trained at places (n, 3) [m, local], `cells` by these.
 
         Raises:
             ValueError: both ends move, or the model states no variance.
@@ -126,7 +126,7 @@ class Locator:
 def trusted(
     learned: Learned, locator: Locator, folds: int, cells: Callable[[np.ndarray], Cells]
 ) -> tuple[Trust, int]:
-    """How far such a method is trusted, from training places that it left out, and their number.
+    """Return how far such a method is trusted, from training places that it left out, and their number.
 
     The method is trained again without each of a few groups (`folds`) of its training rows, cut as the test
     rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
@@ -158,12 +158,12 @@ def trusted(
 
 
 def trust_state(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
-    """For a checkpoint's `extra`."""
+    """Return what `restored` reads again, for a checkpoint's `extra`."""
     return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
 
 
 def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
-    """The trust that `trust_state` held.
+    """Return the trust that `trust_state` held.
 
     Where nothing was, areas are as wide as the model's own variances say, which is logged.
 
@@ -184,7 +184,7 @@ def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
 
 
 def in_world(located: Located, origin: np.ndarray) -> Located:
-    """The same with places in the world's coordinates."""
+    """Return the same with places in the world's coordinates."""
     cells = replace(located.posterior.cells, centre=located.posterior.cells.centre + origin)
     posterior = replace(located.posterior, cells=cells)
     return replace(located, place=located.place + origin, posterior=posterior)

@@ -20,7 +20,7 @@ SHIFTS, NEAR = 20, 0.01  # steps up the density at most, and of a width that the
 
 
 def likeliest(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
-    """The densest cells (c,) of G that hold a share of the mass, densest first."""
+    """Return the densest cells (c,) of G that hold a share of the mass, densest first."""
     order = np.argsort(-log_density, kind="stable")
     return order[: int(np.searchsorted(np.cumsum((np.exp(log_density) * size)[order]), share)) + 1]
 
@@ -47,8 +47,10 @@ class Posterior:
         """(G,) log mass by size of a cell, of total mass 1."""
         if not self.spread:
             return self.sharp
+        # Cells beyond the blurred ones stay sharp: blurring them all would cost G^2.
         density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
         logarithm = np.log(density + LEAST)
+        # Normalised again: densities at centres do not sum to 1, and a blur leaves the site.
         return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.size))
 
     @property
@@ -67,6 +69,7 @@ class Posterior:
     def level(self, place: np.ndarray) -> float:
         """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
         here, mass = self.at(place), self.mass
+        # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
 
     @cached_property
@@ -84,7 +87,9 @@ class Posterior:
         """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""
         live = self.cells.edge.max(0) > 0
         centre, edge = (part[self._blurred][:, live] for part in (self.cells.centre, self.cells.edge))
+        # A uniform density over an edge has the variance edge^2 / 12.
         precision = 1 / (self.spread**2 + edge**2 / 12)
+        # About the middle: squares of large coordinates cancel in the product below.
         middle = centre.mean(0)
         near, apart = centre - middle, places[:, live] - middle
         squared = apart**2 @ precision.T + (near**2 * precision).sum(1) - 2 * apart @ (near * precision).T
@@ -93,7 +98,7 @@ class Posterior:
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
 
     def peak(self) -> np.ndarray:
-        """The likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
+        """Return the likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
 
         By mean shift, which needs no step length (D. Comaniciu and P. Meer, "Mean shift: a robust approach
         toward feature space analysis", IEEE TPAMI 24 (2002)).
@@ -108,7 +113,7 @@ class Posterior:
         return place
 
     def within(self, share: float) -> np.ndarray:
-        """The most likely cells (c,) that hold a share of the mass, most likely first."""
+        """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
         return likeliest(self.log_density, self.cells.size, share)
 
     def modes(self, share: float) -> list[np.ndarray]:
@@ -116,6 +121,7 @@ class Posterior:
         some = self.within(share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
+        # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.
         touch = (np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
                  <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)  # fmt: skip
         pairs = pairs[touch]

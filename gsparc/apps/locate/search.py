@@ -41,12 +41,12 @@ class Looked:
         return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
 
     def by(self, trust: Trust) -> Posterior:
-        """What is known of the place."""
+        """Return what is known of the place."""
         return Posterior(self.cells, self.log_density(trust), trust.spread)
 
 
 def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
-    """Of snapshots at places; see `gsparc.apps.locate.likelihood`."""
+    """Return the misfit of snapshots at places; see `gsparc.apps.locate.likelihood`."""
     if heard.kind == "spectrum":
         return likelihood.of_spectra(heard.values, there.mean, there.variance)
     if heard.kind == "csi":

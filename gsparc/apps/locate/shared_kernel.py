@@ -21,7 +21,7 @@ def stretched(places: np.ndarray, vertical: float) -> np.ndarray:
 
 
 def settings(outputs: Tensor, places: np.ndarray, seed: int) -> tuple[Prior, float]:
-    """The kernel of largest density of values at places left out, and what a metre of height counts as.
+    """Return the kernel of largest density of values left out, and what a metre of height counts as.
 
     Args:
         outputs: (n, P) less their means.

@@ -48,7 +48,7 @@ class SiteField:
 
     @torch.no_grad()
     def at(self, places: Tensor) -> Moments:
-        """Of places (G, 3) float64 [m, local].
+        """Return what would be heard at places (G, 3) float64 [m, local].
 
         Raises:
             ValueError: the model states no variance.

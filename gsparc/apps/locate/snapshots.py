@@ -35,7 +35,7 @@ class Snapshots:
         return len(self.values)
 
     def at(self, chosen: np.ndarray) -> Snapshots:
-        """The snapshots `chosen`."""
+        """Return the snapshots `chosen`."""
         index = torch.from_numpy(np.asarray(chosen))
         floor = None if self.floor is None else self.floor[index]
         return Snapshots(self.kind, self.values[index], floor, self.place[chosen], self.rows[chosen])

@@ -30,11 +30,12 @@ def speed(places: np.ndarray, seconds: np.ndarray, walk: np.ndarray) -> float:
     order = np.lexsort((seconds, walk))
     gone, took = np.linalg.norm(np.diff(places[order], axis=0), axis=1), np.diff(seconds[order])
     moved = (np.diff(walk[order]) == 0) & (took > 0)
+    # A median: standing still and single jumps of recorded places leave it alone.
     return float(np.median(gone[moved] / took[moved])) if moved.any() else 0.0
 
 
 def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s: float) -> list[Posterior]:
-    """What is known of each place given all snapshots of a track, over its heaviest cells.
+    """Return what is known of each place given all snapshots of a track, over its heaviest cells.
 
     Args:
         posteriors: of each snapshot on its own, by an even prior.
@@ -51,14 +52,18 @@ def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s:
         before = mass[order[0]]
         for start, end in pairwise(order):
             cell = np.median(np.r_[cells[start].edge.max(1), cells[end].edge.max(1)])
+            # Never less than half a cell, or a slow step between two centres would be impossible.
             spread = max(metres_per_s * abs(seconds[end] - seconds[start]) / np.sqrt(2), cell / 2)
             near = cdist(cells[end].centre, cells[start].centre, "sqeuclidean")
             normal = (2 * np.pi * spread**2) ** ((cells[end].edge.max(0) > 0).sum() / 2)
+            # Divided by its sum: over a long track products of masses would underflow.
             step = np.exp(near / (-2 * spread**2)) @ (before / before.sum()) / normal
+            # A hundredth of steps goes anywhere, so that one wrong snapshot does not forbid all later ones.
             density = (1 - ANYWHERE) * step + ANYWHERE / posteriors[end].cells.size.sum()
             over[end], before = over[end] * density, mass[end] * density
 
     product = list(mass)
+    # Forwards, then backwards: each snapshot's own mass counts once in the product.
     passed(product, order)
     passed(product, order[::-1])
     return [
@@ -68,7 +73,7 @@ def smoothed(posteriors: Sequence[Posterior], seconds: np.ndarray, metres_per_s:
 
 
 def as_looked(posterior: Posterior) -> Looked:
-    """The same for calibration: of a trust its temperature alone changes it."""
+    """Return the same for calibration: of a trust its temperature alone changes it."""
     density = torch.from_numpy(posterior.log_density)[None]
     none = torch.zeros_like(density)
     return Looked(posterior.cells, Misfit(none, none, none[:, 0], density))

@@ -71,7 +71,7 @@ def grid_of(
     plan: FloorPlan | None = None,
     stations: int = 1,
 ) -> Grid:
-    """The cells of a map.
+    """Return the cells of a map.
 
     Args:
         site: of the model; None before there is one: then an area or a plan says where.

@@ -46,12 +46,12 @@ class ErrorCovariance:
         self.covariance -= np.outer(column, column / (column[place] + self.noise))
 
     def gains(self, targets: np.ndarray) -> np.ndarray:
-        """What a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
+        """Return what a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
         explained = (self.weight * targets) @ self.covariance**2
         return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
     def variances(self) -> np.ndarray:
-        """Of a measurement's error at each place (S,), as held-out blocks scale it."""
+        """Return variances of a measurement's error at each place (S,), as held-out blocks scale it."""
         return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
 
@@ -62,7 +62,7 @@ def unknown_of(
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:
-    """At world places (S, 3) [m] of every station, by the model's process, or one of what it predicts.
+    """Return error covariances at world places (S, 3) [m] of every station, by its process or predictions.
 
     Held-out blocks of `promise` scale the variances.
 
@@ -105,7 +105,7 @@ def _of_cell(joint: HasJoint, local: np.ndarray, number: int) -> tuple[np.ndarra
 
 
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
-    """The same where nothing was measured: shadowing about a level nobody knows, alike over
+    """Return the same where nothing was measured: shadowing about a level nobody knows, alike over
     `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
     """
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)

@@ -39,7 +39,7 @@ class FieldMap:
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
         outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
         share: of measurements that the intervals hold; the field alone lies in them more often.
-        calibrated: whether arrays-out blocks say so; else the model's own deviations alone.
+        calibrated: whether held-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
         extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`, `overlap`.
         places: (n, 2) where was measured, world [m].
@@ -82,13 +82,14 @@ class FieldMap:
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
     def strongest(self, layers: np.ndarray) -> np.ndarray:
-        """Of layers (T, ny, nx), that of each cell's strongest station (ny, nx); NaN where refused."""
+        """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx); NaN where refused."""
         number = np.maximum(self.best_server, 0).astype(np.int64)
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
     def raised(self, decibels: float, unit: str) -> FieldMap:
-        """The same map with levels so many decibels higher, which is in another unit."""
+        """Return the same map with levels so many decibels higher, which is in another unit."""
+        # Errors and probabilities do not change with the unit, differences of levels neither.
         levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
         return replace(self, **levels, threshold_db=self.threshold_db + decibels, unit=unit)
 
@@ -113,7 +114,7 @@ class FieldMap:
 
     @classmethod
     def read(cls, path: str | Path) -> FieldMap:
-        """What `save` wrote; without measured places, stations' places and notes, which it does not hold.
+        """Return what `save` wrote; it does not hold measured places, stations' places and notes.
 
         Raises:
             DataError: no such file, or not one of a map.
@@ -122,6 +123,7 @@ class FieldMap:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             x, y, inside = arrays.pop("x"), arrays.pop("y"), arrays.pop("inside")
+            # A map of a single cell has no step to be read: 1 m.
             step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
             grid = Grid(x, y, float(arrays.pop("height")), step, inside)
             names = tuple(str(name) for name in arrays.pop("stations"))
@@ -131,6 +133,7 @@ class FieldMap:
                 facts[name] = kind(arrays.pop(name))
         except FileNotFoundError:
             raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
+        # BadZipFile and EOFError: a file cut off while it was copied.
         except (KeyError, ValueError, OSError, EOFError, BadZipFile):
             raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
         return cls(grid=grid, stations=names, extra=arrays, **facts)
@@ -170,6 +173,7 @@ def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
 def best_server(power_db: np.ndarray) -> np.ndarray:
     """Number of the strongest of (T, n) powers [dB], (n,) int16; `REFUSED` where none is known."""
     known = np.isfinite(power_db)
+    # -inf, since argmax takes the first NaN for the largest.
     number = np.where(known, power_db, -np.inf).argmax(axis=0)
     return np.where(known.any(axis=0), number, REFUSED).astype(np.int16)
 
@@ -195,8 +199,11 @@ def server_chance(
     number, known = best_server(power_db), np.isfinite(power_db)
     first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
     mean, spread = power_db[first, cell], error_db[first, cell]
+    # A station unknown in a cell may be heard all the same: as likely as it usually is.
     rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
+    # Var(a - b) with their correlation; never 0, which would divide.
     apart = np.sqrt(np.maximum(spread**2 + wrong**2 - 2 * alike * spread * wrong, 1e-12))
+    # A station that nothing is known of anywhere is left out: it counts as beaten.
     beats = np.nan_to_num(norm.cdf((mean - rival) / apart), nan=1.0)
     beats[first, cell] = norm.cdf((mean - floor_db[first]) / spread)
     return np.where(number == REFUSED, np.nan, beats.prod(axis=0)).astype(np.float32)
@@ -216,6 +223,7 @@ def sinr(
     Returns:
         NaN where no power is known, or where there is neither noise nor interference.
     """
+    # float64: 10^(-12) beside 10^(-4) keeps no digit of interference in float32.
     linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
     number = best_server(power_db)
     first, cell = np.maximum(number, 0), np.arange(linear.shape[1])
@@ -223,6 +231,7 @@ def sinr(
     same = True if carrier is None else carrier[:, None] == carrier[first]
     every = load @ (linear * same) - load[first] * signal
     noise = 0.0 if noise_db is None else 10 ** (noise_db / 10)
+    # The sum less its own part may round below 0 where one station is alone.
     rest = np.maximum(every, 0.0) + noise
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 10 * np.log10(signal / rest)
@@ -260,7 +269,7 @@ def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequenc
 
 
 def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
-    """Whether a GeoTIFF is written; None: where it can be.
+    """Return whether a GeoTIFF is written; None: where it can be.
 
     Raises:
         DataError: it is asked for, and cannot be.
@@ -299,5 +308,6 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference) -> N
     }  # fmt: skip
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), 1):
+            # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)
             file.set_band_description(number, name)

@@ -47,7 +47,7 @@ class FloorPlan:
         return one.real, one.imag, two.real, two.imag, self.shift.real, self.shift.imag
 
     def light(self, places: np.ndarray) -> np.ndarray:
-        """Whether there is open floor (m,), a light pixel, at world places (m, 2) [m]."""
+        """Return whether there is open floor (m,), a light pixel, at world places (m, 2) [m]."""
         pixel = (places[:, 0] + 1j * places[:, 1] - self.shift) / self.scale
         column, row = np.floor(pixel.real).astype(int), np.floor(-pixel.imag).astype(int)
         height, width = self.image.shape[:2]
@@ -103,7 +103,7 @@ def _checked(points: Any, path: str | Path) -> np.ndarray:
 
 
 def plan_of(settings: Mapping[str, Any]) -> FloorPlan | None:
-    """The floor plan that `plan` and `plan_points` of settings name; None where they name none.
+    """Return the floor plan that `plan` and `plan_points` of settings name; None where they name none.
 
     Raises:
         DataError: points without an image, or one that cannot be read.

@@ -173,7 +173,7 @@ def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Of values (n,) with masses (n,), those below which lie such shares; of equal ones as `np.quantile`."""
+    """Return values, of (n,) with masses (n,), below which shares lie; of equal ones as `np.quantile`."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(mass[order]) - mass[order]
     return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
@@ -272,7 +272,7 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
 def distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
-    """From places (n, D) to the nearest of `known` (m, D) of their station, of any where it has none [m]."""
+    """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""
     distance = np.full(len(places), np.inf)
     for number in np.unique(station):
         own = known[known_station == number]

@@ -35,6 +35,7 @@ def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[n
         power = mean[:, 0].astype(np.float64) * scale
     else:
         own = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
+        # Var |m + e|^2 for complex normal e is 2 |m|^2 v + v^2.
         power, error = own + error, 2 * own * error + error**2
     level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
     good = np.isfinite(power) & (power > 0)
@@ -50,6 +51,7 @@ def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     power = target if data.site.kind == "rssi" else target**2
     side = data.side(rows)
     if data.mask is not None:
+        # Censored rows are masked out as targets, but their levels are known.
         seen = data.mask[rows].reshape(power.shape) | (side != 0)[:, None]
         power = np.where(seen, power, np.nan)
     known = np.isfinite(power)
@@ -60,7 +62,7 @@ def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def joint_of(method: Method) -> HasJoint | None:
-    """What knows how levels of all its stations go together; None where each is by itself."""
+    """Return what knows how levels of all its stations go together; None where each is by itself."""
     every = method.every() if isinstance(method, PerStation) else None
     return None if every is None else every.joint()
 
@@ -77,6 +79,7 @@ def cells_of(joint: HasJoint, site: Site, places: np.ndarray, stations: np.ndarr
     moving = torch.from_numpy(places - site.origin)[:, None].expand(-1, len(stations), 3)
     level, covariance, _ = (part.numpy() for part in joint.joint(moving, torch.from_numpy(stations)))
     spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    # Of the correlations only those with the strongest decide which station serves.
     row, first = np.arange(len(level)), level.argmax(1)
     alike = covariance[row, first] / (spread * spread[row, first][:, None])
     return np.stack([level + 10 * np.log10(site.target_scale), spread, alike], 1)

@@ -30,6 +30,7 @@ from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
+# What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
 BANDS = 1 << 16  # cells at a time of what follows from predictions
 OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
 
@@ -75,6 +76,7 @@ def map_of(
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
     load_of = loads(load, names)
     level = PowerUnit.of(unit, site.level_unit, levels=True)
+    # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
     noise_db = None if noise_db is None else noise_db - level.raised_db
     if dry:
@@ -114,8 +116,10 @@ def map_of(
             local = local_of(site, grid.places(cells), other_end, site.static_end is None)
             far = np.stack([promise.distance(local, number) for number in numbers])
         half = calibration.interval(spread, far, numbers[:, None])
+        # The strongest before anything is refused, to which `alike` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
         error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
+        # To float32 before comparing: what is stored decides the best server.
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
         strongest = np.maximum(best, 0), np.arange(len(best))
@@ -183,6 +187,7 @@ def answering(
     if not names:
         raise DataError("stations=[]: name one at least, or all")
     notes = []
+    # Names may be given twice, by name and by number.
     for name in dict.fromkeys(names):
         try:
             predictor.at(name)
@@ -210,6 +215,7 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
     if len(places) < 2:
         return 1
     apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    # A power of two, since cells between are filled by halving.
     return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
 
 
@@ -319,6 +325,7 @@ def _usual(
         if len(own):
             usual[row] = own.level_db.mean(), own.level_db.std()
             quiet = own.level_db[own.side > 0]
+            # 1 %, not the least: one faulty row would place the floor anywhere.
             floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
     return usual, floor
 

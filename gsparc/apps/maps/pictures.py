@@ -56,13 +56,15 @@ class Legend:
 
     def of(self, values: np.ndarray) -> np.ndarray:
         """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
+        # Masked: what is infinite is grey, too, instead of the colour of an end.
         share = Normalize(self.low, self.high, clip=True)(np.ma.masked_invalid(values))
         return colormaps[self.colours].with_extremes(bad=GREY)(share, bytes=True)[..., :3]
 
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
-        """From the 1 to the 99 % quantile of those values that are finite."""
+        """Return colours from the 1 to the 99 % quantile of those values that are finite."""
         known = values[np.isfinite(values)]
+        # One and 99 %: a cell at a mast would leave one colour for the rest.
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
         return cls(label, float(low), float(high if high > low else low + 1.0), colours)
 
@@ -102,24 +104,29 @@ def shades(classes: np.ndarray, count: int) -> np.ndarray:
         return np.arange(count)
     number = np.where(np.isfinite(classes), classes, count).astype(int)
     beside = np.zeros((count + 1, count + 1), int)
+    # Two cells: areas that a thin strip parts look as if they met.
     for step in range(1, BESIDE + 1):
         np.add.at(beside, (number[step:], number[:-step]), 1)
         np.add.at(beside, (number[:, step:], number[:, :-step]), 1)
     beside += beside.T
     result = np.full(count, -1)
+    # Large areas first, which have most neighbours, then the rest by what is left.
     for one in np.argsort(-np.bincount(number.reshape(-1), minlength=count)[:count], kind="stable"):
         used = result >= 0
         near = np.bincount(result[used], beside[one, :count][used], MOST_COLOURS)
+        # Fewest borders of one colour first, of these the colour that is used least.
         result[one] = np.lexsort((np.bincount(result[used], minlength=MOST_COLOURS), near))[0]
     return result
 
 
 def named_areas(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
     """Row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
+    # Deeper than a letter at the picture's size, or the name hides its area.
     least = max(DEEP * max(classes.shape), 1.5)
     for number in np.unique(classes[np.isfinite(classes)]).astype(int):
         parts, count = areas_of(classes == number)
         for part in range(1, count + 1):
+            # Padded, since the map's edge ends an area as well.
             deep = distance_transform_edt(np.pad(parts == part, 1))[1:-1, 1:-1]
             if deep.max() >= least:
                 yield *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)), words[number]
@@ -174,7 +181,7 @@ def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], doubt: An
 
 
 def file_name(layer: Layer) -> str:
-    """Of its PNG, without what a file system may not like."""
+    """Return the name of its PNG, without what a file system may not like."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
@@ -240,7 +247,7 @@ def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **
 
 
 def draw_plan(axis: Any, plan: FloorPlan) -> None:
-    """The floor plan, where it lies."""
+    """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     a, b, c, d, e, f = plan.matrix()
     turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
@@ -274,6 +281,7 @@ def draw_plan_picture(
         11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
     )
     errors = np.concatenate([batch.error_before, batch.error_after])
+    # 99.5 %: a single corner far from all rows would flatten the rest.
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
     for axis, values, title in ((before, batch.error_before, "before"), (after, batch.error_after, "after")):
         image = np.full(batch.grid.shape, np.nan)
@@ -298,7 +306,7 @@ def draw_plan_picture(
 
 
 def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
-    """The goal at every candidate, the stations that stand, and the best place."""
+    """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     label = f"share of the area with {threshold_db:g} {unit} or more"

@@ -22,6 +22,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
 Goal = Literal["coverage", "worst"]
+# A tenth of the area may lie below it: the least of all cells would be one behind a wall.
 DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
@@ -130,6 +131,7 @@ def place_next(
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells)
         goals = np.empty(3)
+        # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
             if goal == "worst":
                 goals[k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
@@ -155,15 +157,20 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStation:
     heard = np.unique(data.station[known])
     if len(heard) < LEAST_STATIONS:
         return NewStation()
+    # By the seed of the training: the same stations are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
+    # Without validation rows: the station left out is the test, all else is learned from.
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
         parts.append(evidence_of(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
+    parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
+    if not parts:
+        return NewStation()
     errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
-    means = np.array([error.mean() for error in errors if len(error)])
-    pairs = zip(errors, means, parts, strict=False)
+    means = np.array([error.mean() for error in errors])
+    pairs = zip(errors, means, parts, strict=True)
     inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
     within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
     return NewStation(float(np.sqrt(np.mean(means**2))), within, len(means))
@@ -185,7 +192,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np
 
 
 def unheard_stations_error(what: str) -> DataError:
-    """For models that know no station but those they learned from."""
+    """Return the error for models that know no station but those they learned from."""
     return DataError(
         f"{what}: answers only for the stations that it heard; train with stations=together, for example "
         "model=gp or distance_law"
@@ -193,12 +200,12 @@ def unheard_stations_error(what: str) -> DataError:
 
 
 def number(what: Goal, value: float, unit: str = "dB") -> str:
-    """A goal's value with its unit."""
+    """Return a goal's value with its unit."""
     return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
 
 
 def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
-    """A goal's value in words."""
+    """Return a goal's value in words."""
     if what == "coverage":
         return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
     return f"nine tenths of the area have {number(what, value, unit)} or more"

@@ -24,6 +24,7 @@ from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_nul
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
+# Covariances are over all places: 900 targets and 900 candidates are 26 MB in float64.
 TARGETS = 900  # places that the error is averaged over, about
 CANDIDATES = 900  # where somebody may measure, at most
 WORTH = 0.02  # share of the expected error over an area, that places must take away to be worth their walk
@@ -126,6 +127,7 @@ def plan_next(
     targets = grid.places()
     allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
     places, free, wanted = _joined(targets, allowed)
+    # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
         unknown = before_measuring(places, length_m)
     else:
@@ -155,11 +157,12 @@ def coarse_grid(
     plan: FloorPlan | None = None,
     promise: Promise | None = None,
 ) -> Grid:
-    """About `TARGETS` cells; where nobody says which, those that a promise reaches."""
+    """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
     fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
         far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.shape)
+        # No farther than a promise reaches: where nothing is said, measuring cannot be weighed.
         fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
     left, right, low, high = fine.extent
     share = fine.inside.mean()
@@ -182,6 +185,7 @@ def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str
     points = [np.zeros((0, 2))]
     if not area.is_empty:
         low, high = np.reshape(area.bounds, (2, 2))
+        # Four times too many, since bounds of a corridor's polygon are mostly empty.
         step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
         x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -193,6 +197,7 @@ def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str
     if not len(places):
         raise DataError(f"{key}={path}: its polygons are too small for any place")
     if len(places) > CANDIDATES:
+        # A fixed seed: the same file gives the same candidates.
         places = places[np.random.default_rng(0).permutation(len(places))[:CANDIDATES]]
     return np.column_stack([places, np.full(len(places), grid.height)])
 
@@ -222,12 +227,14 @@ def greedy(
     expected: list[float] = []
     error = _expected(unknown, wanted)
     while len(chosen) < count:
+        # Sums of variances taken away over stations: one walk measures all of them.
         gains = np.sum([one.gains(wanted) for one in unknown], axis=0)
         possible = free & tour.within(places)
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
+        # Mean square errors subtract, roots do not.
         left = error**2 - gains[best] / (len(unknown) * wanted.sum())
         gain = error - float(np.sqrt(max(left, 0)))
         if gain < least_gain_db:
@@ -290,7 +297,7 @@ class Tour:
 
     @staticmethod
     def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
-        """Of a walk through places (n, 2 or 3) in their order [m]."""
+        """Return the length of a walk through places (n, 2 or 3) in their order [m]."""
         stops = places[:, :2] if start is None else np.vstack([start, places[:, :2]])
         return float(np.hypot(*np.diff(stops, axis=0).T).sum()) if len(stops) > 1 else 0.0
 
@@ -303,6 +310,7 @@ class Tour:
         """What each of places (n, 2) adds to the walk before each stop, or at its end: (stops + 1, n) [m]."""
         stops = self._ends()
         to = _apart(stops[:, None], places)
+        # Cheapest insertion: the way over the new place less the way there was.
         return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
 
     def _shorten(self) -> None:
@@ -314,10 +322,12 @@ class Tour:
             for i in range(1, len(walk) - 2):
                 for j in range(i + 1, len(walk) - 1):
                     a, b, c, d = walk[i - 1], walk[i], walk[j], walk[j + 1]
+                    # 1e-9 m: equal exchanges would go round for ever.
                     if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-9:
                         walk[i : j + 1] = walk[i : j + 1][::-1]
             if walk == before:
                 break
+        # Stop 0 is the start, hence places are numbered one less.
         self.stops, self.number = stops[walk[1:-1]], self.number[np.array(walk[1:-1], int) - 1]
 
 

@@ -71,7 +71,7 @@ class Promise:
         return cross_validated(self.evidence, share)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
-        """From local places (n, D) to the nearest that was learned from (n,) [m]."""
+        """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
         return distances(self.known, self.station, places, np.full(len(places), station))
 
     def keep(self, path: str | Path) -> None:
@@ -80,7 +80,7 @@ class Promise:
 
 
 def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
-    """What a checkpoint's `extra` holds; None where its map was never calibrated."""
+    """Return what a checkpoint's `extra` holds; None where its map was never calibrated."""
     state = extra.get(KEY)
     if state is None:
         return None
@@ -104,28 +104,32 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
     if settings.budget_s is not None:
         learned = replace(learned, context=replace(learned.context, budget_s=settings.budget_s))
     longest = float(np.ptp(places[:, -3:-1], axis=0).max())
+    # A tenth of the site: blocks large against the distance between rows, and some hundred of them.
     side = settings.block_m or longest / 10
     if not side > 0:
         raise DataError("a promise about a map needs rows at more than one place; measure more")
 
     def evidence_without(number: int) -> Evidence:
+        # Every second fold with sides twice as long, for evidence at larger distances.
         split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
         cut = learned.cut(1, settings.seed + number // len(SIDES), split)
         inner = learned.answerable(cut.folds[0])
         less = learned.without(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
+        # Blocks of two folds are never one, though they may hold the same rows.
         unit = cut.unit[tried] + number * (len(data) + 1)
         return evidence_of(less, data, replace(inner, test=tried), unit)
 
     by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    # In the order of folds, whichever ended first: evidence must not depend on it.
     parts = [by_number[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_of(data, learned.rows), side)
 
 
 def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
-    """Of the test rows of a fold, which `method` was fitted to; `block` (n,) says which belong together."""
+    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
     level, side = measured(data, rows)

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
-    """The evidence stored with a model, or gathered from its training data and then stored.
+    """Return the evidence stored with a model, or gathered from its training data and then stored.
 
     Args:
         path: the model's file.
@@ -34,6 +34,7 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
         return None
     stored = checkpoint.read(path)
     promise = None if settings.get("renew") else stored_promise(stored.extra)
+    # Blocks of another size are other evidence.
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
     learned = trained(path, settings["dataset"])
@@ -45,7 +46,7 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
 
 
 def trained(path: str, dataset: dict[str, Any]) -> Learned:
-    """A model with the very data and rows that it was trained on.
+    """Return a model with the very data and rows that it was trained on.
 
     Raises:
         DataError: they are gone, or are others.
@@ -57,13 +58,14 @@ def trained(path: str, dataset: dict[str, Any]) -> Learned:
         raise DataError(
             f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
         ) from None
+    # Rows of other data are no evidence of what this model has not seen.
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
     return learned
 
 
 def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
-    """What a reader of the map must know."""
+    """Return what a reader of the map must know."""
     notes = [*field.notes]
     figures = field.figures()
     share = figures["map/server_unsure"]

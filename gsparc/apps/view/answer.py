@@ -81,7 +81,7 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
 
 
 def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
-    """Of a direction (3,) [degrees]."""
+    """Return azimuth and elevation of a direction (3,) [degrees]."""
     x, y, z = towards
     return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 

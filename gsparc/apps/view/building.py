@@ -148,7 +148,7 @@ def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
-    """What colours mean, and those (N, 3) uint8 of Gaussians by emission, below the strongest."""
+    """Return what colours mean, and those (N, 3) uint8 of Gaussians by emission, below the strongest."""
     most = float(np.abs(cloud.strengths).max(initial=0.0))
     level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
     legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
@@ -214,7 +214,7 @@ class Sphere:
 
     @classmethod
     def of(cls, site: Site, extent: float) -> Sphere:
-        """Of a site of spectra; not more than `DIRECTIONS`."""
+        """Return directions of a site of spectra; not more than `DIRECTIONS`."""
         assert site.grid is not None
         directions = site.grid.directions().numpy()
         every = max(1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS))))

@@ -28,7 +28,7 @@ class Obstacles:
 
     @classmethod
     def of(cls, walls: SceneWalls) -> Obstacles:
-        """What is known of a scene."""
+        """Return what is known of a scene."""
         count = np.array([len(face) - 2 for face in walls.faces], np.int64)
         return cls(fans(walls.faces), np.repeat(np.arange(len(count)), count), walls.boxes)
 

@@ -38,7 +38,7 @@ class Plane:
 
 
 def thinned(grid: Grid, most: int) -> Grid:
-    """At most about `most` cells along the longer side, of every n-th row and column."""
+    """Return at most about `most` cells along the longer side, of every n-th row and column."""
     every = max(1, -(-max(grid.shape) // most))
     return Grid(
         grid.x[::every], grid.y[::every], grid.height, grid.step * every, grid.inside[::every, ::every]
@@ -81,7 +81,7 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
 
 
 def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
-    """A picture of values (ny, nx) over the cells, clear where they are not finite, `beneath` [m] lower.
+    """Return a picture of values (ny, nx) over the cells, clear where not finite, `beneath` [m] lower.
 
     Half a dot lower, dots of the same height are seen whole.
     """
@@ -110,7 +110,7 @@ def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
 
 
 def beyond_distance(plane: Plane, known: Usual, other: np.ndarray) -> Plane:
-    """What is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
+    """Return what is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
     grid = plane.grid
     cells = np.arange(plane.level_db.size)
     distance = np.linalg.norm(grid.places(cells) - other, axis=1).reshape(grid.shape)

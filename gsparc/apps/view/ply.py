@@ -37,7 +37,7 @@ def write_ply(path: str | Path, cloud: GaussianCloud, colours: np.ndarray) -> No
 
 
 def ply_bytes(cloud: GaussianCloud, colours: np.ndarray) -> bytes:
-    """What `write_ply` writes."""
+    """Return what `write_ply` writes."""
     share = np.clip(cloud.opacities, LEAST_SHARE, 1 - LEAST_SHARE)
     columns = np.column_stack(
         [

@@ -15,6 +15,7 @@ from gsparc.apps.view.building import SURFACES
 from gsparc.apps.view.crossed import Obstacles
 from gsparc.apps.view.scene import Faces, Part
 
+# Nearer than .1 m no distance law holds, and its logarithm goes to infinity.
 NEAREST_M = 0.1  # where a distance law ends
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
 
@@ -49,8 +50,8 @@ class Usual:
 
 
 def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
-    """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
-    NaN where that is unknown."""
+    """Return the distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or
+    (n, 3); NaN where that is unknown."""
     known = np.isfinite(level_db)
     tree = cKDTree(places if other is None or other.ndim == 1 else np.column_stack([other, places]))
     level = level_db[known]
@@ -58,6 +59,7 @@ def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) ->
         return Usual(np.nan, np.nan, np.nan, tree, np.zeros(0), level)
     distance = np.maximum(np.linalg.norm((places - other)[known], axis=1), NEAREST_M)
     far = np.log10(distance)
+    # Least squares in log10(distance): the slope is ten times the path loss exponent.
     slope, at_one = np.polyfit(far, level, 1) if np.ptp(far) > 0 else (0.0, level.mean())
     spread = float(np.std(level - at_one - slope * far))
     return Usual(float(at_one), float(-slope), spread, tree, distance, level)
@@ -107,6 +109,7 @@ def _between(answer: Answer, here: np.ndarray, there: np.ndarray, about: Surroun
     if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
         plain = float(known.at(far))
         gap = answer.level_db - plain
+        # A deviation of measured levels, beyond which a reader may ask for a reason.
         weak = gap < -known.spread_db
         how = "weaker" if weak else "stronger" if gap > known.spread_db else "as usual"
         lines.append(
@@ -130,6 +133,7 @@ def _nearest(answer: Answer, here: np.ndarray, tree: cKDTree) -> str:
         apart = float(tree.query(here)[0])
         return "measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away"
     ends = np.concatenate([answer.ends["tx"], answer.ends["rx"]])
+    # Both ends moved: the row measured with both nearest, in six dimensions.
     row = tree.data[int(tree.query(ends)[1])]
     one, two = (float(np.linalg.norm(part)) for part in np.split(row - ends, 2))
     if max(one, two) < 1e-3:
@@ -149,6 +153,7 @@ def _paths(answer: Answer) -> list[str]:
         f"{rays.delay_ns[0]:.1f} ns{more}"
     ]
     if answer.level_db is not None and len(rays.gain_db) > 1:
+        # Powers of paths added without phase, to tell fading from weakness.
         gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
         if abs(gap) >= PHASES_DB:
             how = "cancel each other" if gap < 0 else "add up"
@@ -173,7 +178,7 @@ def headline(answer: Answer, unit: str = "dB") -> str:
 
 
 def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
-    """An answer and why, for a panel."""
+    """Return an answer and why, for a panel."""
     lines = [f"**{headline(answer, unit)}**", ""]
     lines += [
         f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"

@@ -25,16 +25,18 @@ class Frame:
 
     @classmethod
     def around(cls, places: np.ndarray) -> Frame:
-        """A frame in which places (n, 3) [m] are about `EXTENT` wide."""
+        """Return a frame in which places (n, 3) [m] are about `EXTENT` wide."""
         low, high = places.min(axis=0), places.max(axis=0)
+        # 1 mm: a single place has a frame, too.
         return cls((low + high) / 2, EXTENT / max(float((high - low).max()), 1e-3))
 
     def drawn(self, places: np.ndarray) -> np.ndarray:
         """World places (..., 3) [m] as float32 in drawn units; float64 until the middle is taken away."""
+        # Float32 of UTM metres moves in steps of half a metre.
         return np.asarray((places - self.middle) * self.scale, np.float32)
 
     def world(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of `points`, float64."""
+        """Return the inverse of `drawn`, float64."""
         return np.asarray(points, np.float64) / self.scale + self.middle
 
 
@@ -129,5 +131,5 @@ class Scene:
     notes: tuple[str, ...] = ()
 
     def part(self, name: str) -> Part | None:
-        """The part of that name, if it is there."""
+        """Return the part of that name, if it is there."""
         return next((part for part in self.parts if part.name == name), None)

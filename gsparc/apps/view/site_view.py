@@ -73,15 +73,16 @@ class SiteView:
         return self.viewed.unit
 
     def station(self, name: str | None) -> StationView:
-        """Of a station; made when it is first asked for, which takes seconds. Those made wait for nobody."""
+        """Return the view of a station, made when first asked for, in seconds; those made wait for nobody."""
         if name not in self._made:
+            # Two clients that ask for a new station at once wait for one making of it.
             with self._lock:
                 if name not in self._made:
                     self._made[name] = self._make(name)
         return self._made[name]
 
     def has(self, name: str | None) -> bool:
-        """Whether a station was made."""
+        """Return whether a station was made."""
         return name in self._made
 
     def _make(self, name: str | None) -> StationView:
@@ -139,7 +140,7 @@ def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> G
 
 
 def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
-    """At most `count` measured places in the order of measuring, or along the box's diagonal."""
+    """Return at most `count` measured places in the order of measuring, or along the box's diagonal."""
     measured = view.station(name).measured
     if measured is None:
         low, high = view.viewed.box()

@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 MOST_ERRORS = 2000  # test rows that errors are drawn of
 LEAST_HEIGHT_M = 0.5  # of a site, between whose floor and ceiling planes are lifted
 CHUNK = 128  # rows of one call
+# 60 dB: a perfect spectrum has no finite PSNR.
 LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
 
 
@@ -79,7 +80,7 @@ class Viewed:
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
     def predictor_of(self, station: str | None) -> Predictor:
-        """Of a station."""
+        """Return the predictor of a station."""
         return self.predictor if station is None else self.predictor.at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
@@ -103,6 +104,7 @@ class Viewed:
         low, high = (float(z) for z in (self.site.box + self.site.origin)[:, 2])
         if high - low <= LEAST_HEIGHT_M:
             low, high = low - 1.5, high + 1.5
+        # Outwards to the centimetre, so that the slider reaches floor and ceiling.
         return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
 
     def rows(self, station: str | None) -> np.ndarray:
@@ -126,6 +128,7 @@ class Viewed:
             label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
         else:
             values, side = levels.measured(data, rows)
+            # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
@@ -146,6 +149,7 @@ def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: 
     if data.site.kind == "spectrum":
         square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
         return -10 * np.log10(np.maximum(square, LEAST_RATIO))
+    # Without its variance the level is that of the mean, as errors are scored.
     mean = replace(prediction, variance=None)
     return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
 
@@ -177,6 +181,7 @@ def open_viewed(
             test = run.split.folds[0].test
         else:
             notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
+    # Data are gone or changed: a model can be looked at without them.
     except (ValueError, OSError) as error:
         predictor = load(path)
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")

@@ -164,7 +164,7 @@ def _message_of(error: BaseException) -> str:
 
 
 def overview(answers: str, config: str) -> str:
-    """What `--help` says: what a command `answers`, its settings with their comments, choices of its groups.
+    """Return what `--help` says: what it `answers`, settings with comments, choices of groups.
 
     Read from files: Hydra's own list of all values has no comments.
     """

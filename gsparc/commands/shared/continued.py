@@ -12,7 +12,7 @@ DEEP = 4  # RUN/fold0/refit/last.ckpt
 
 
 def with_settings_of_run(words: Sequence[str]) -> list[str]:
-    """A command line with the settings of the run that its `ckpt_path=` names; what it says itself wins.
+    """Return a command line with the settings of the run that `ckpt_path=` names; its own win.
 
     Args:
         words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the run was

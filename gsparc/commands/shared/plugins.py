@@ -27,6 +27,7 @@ def offer() -> None:
                 continue
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
             if group == "model" and "seed" in own:
+                # What a plugin draws follows the seed of the run.
                 shared["seed"] = "${seed}"
             node = {**own, **shared}
             ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")
@@ -35,6 +36,7 @@ def offer() -> None:
 def offer_scenes() -> None:
     """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`, which lists them."""
     written = resources.files("gsparc.conf") / "scene"
+    # Scenes that have a file of ours keep its settings.
     nodes = {name: settings(name) for name in shipped() if not (written / f"{name}.yaml").is_file()}
     for name, node in {**nodes, "help": {"name": "help"}}.items():
         ConfigStore.instance().store(name=name, group="scene", node=node, provider="sionna")

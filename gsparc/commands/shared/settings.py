@@ -69,6 +69,7 @@ class RunSettings(Checked):
                 raise SettingError(f"callbacks.{name}={node}: is a group of settings; null leaves it out")
             instantiate(node)  # checks itself
         for key, value in _leaves(values):
+            # YAML's .inf and .nan are floats, and no comparison with NaN refuses it.
             if isinstance(value, float):
                 Limit("a finite number", math.isfinite).check(key, value)
         if settings.threads is not None:

@@ -60,7 +60,7 @@ class Coherence:
 
 
 def coherence(data: Measurements) -> Coherence | None:
-    """The verdict on channels; None where no rows are near enough to tell, or there is one entry a row.
+    """Judge the phases of channels; None where no rows are near enough, or there is one entry a row.
 
     Rows are compared within a run, and all antennas or stations of a moment as one. Nothing is drawn.
     """
@@ -100,7 +100,7 @@ def coherence(data: Measurements) -> Coherence | None:
 
 
 def allowed(data: Measurements, align: str) -> Measurements:
-    """The measurements with what of each row is free: as `align` says, `auto` by `coherence`.
+    """Return measurements with what is free of each row: as `align` says, `auto` by `coherence`.
 
     Raises:
         SettingError: no such freedom, or one of what are no channels.

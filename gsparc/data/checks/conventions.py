@@ -62,7 +62,7 @@ class Score:
 
 
 def convention_warnings(data: Measurements) -> list[str]:
-    """The convention that rows seem to follow instead of the declared one, and the setting that mends it."""
+    """Name the convention that rows seem to follow instead of the declared one, and what mends it."""
     kind = data.site.kind
     if kind == "rssi":
         return []

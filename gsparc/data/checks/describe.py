@@ -18,7 +18,7 @@ LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
-    """(topic, sentence) pairs about a dataset."""
+    """Return (topic, sentence) pairs about a dataset."""
     site, tones = data.site, data.site.subcarriers_hz
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
@@ -60,7 +60,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
 
 
 def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
-    """Five (topic, sentence) pairs about a dataset and how a run divides it."""
+    """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
     train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
     folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
     rows = f"{train} training, {val} validation and {test} test rows{folds}"
@@ -80,7 +80,7 @@ def _carrier(site: Site) -> str:
 
 
 def places_of(data: Measurements) -> np.ndarray:
-    """Places (n, 3) or (n, 6) [m], one of each visit."""
+    """Return places (n, 3) or (n, 6) [m], one of each visit."""
     return data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
 
 
@@ -95,7 +95,9 @@ def _targets(data: Measurements) -> str:
 
 
 def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
-    """How far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
+    """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
+    if len(positions) < 2:
+        return "one place alone"
     distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
     text = f"the nearest other place is {np.median(distance):.3g} m away (median)"
     if wavelength is not None:
@@ -136,13 +138,14 @@ def _moving(data: Measurements) -> str:
 
 
 def suspicious_values(data: Measurements) -> list[str]:
-    """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
+    """Warn of readable but implausible values: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
     hints = []
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
         places, zones = ends[np.isfinite(ends).all(axis=1)], data.provenance.get("zones", "")
+        # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         hints = _units(places, zones) or _units(data.moving[:, :3] + site.origin, zones)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
@@ -151,6 +154,7 @@ def suspicious_values(data: Measurements) -> list[str]:
             hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
+        # Steps in radians taken for degrees: the columns then span 2 pi degrees.
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target == 0).any():
@@ -161,6 +165,7 @@ def suspicious_values(data: Measurements) -> list[str]:
         )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
+        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.
         if 0 < spread < 0.1:
             hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
     return hints
@@ -172,6 +177,7 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
     height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
     reach = np.abs(positions[:, :2]).max(axis=0)
     on_earth = reach.max() <= 180 and reach.min() <= 90
+    # Metres about a local origin lie near it; degrees of a small site lie many of its widths away.
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
         how = "then give them as latitude and longitude"
@@ -181,12 +187,14 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         by = f", as column {zones!r} says" if zones else ""
         said = f"two groups of places {groups[1] / 1e3:.4g} km apart{by}"
         return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
+    # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
         far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
         return [f"{far}; {hint}"]
+    # Survey tools print millimetres as whole numbers; metres come with decimals.
     if across > 1000 and (positions % 1 == 0).all():
         size = " x ".join(f"{e / 1000:.4g}" for e in extent)
         said = f"positions are whole numbers up to {across:.0f} apart"
@@ -212,23 +220,24 @@ APART = 3.0  # least side of a square, in distances of neighbours
 
 
 def side_of_squares(data: Measurements) -> float | None:
-    """Side [m] for `split=blocks`: a tenth of the site and several neighbours wide, a round number.
+    """Return a side [m] for `split=blocks`: a tenth of the site, several neighbours wide, round.
 
     None where the places are too few to hold squares of them out.
     """
-    places = np.unique(data.moving[:, -3:], axis=0)[:, :2]
+    places = np.unique(data.moving[:, :3], axis=0)[:, :2]  # as `split=blocks` cuts squares, of both ends too
     extent = float(np.ptp(places, axis=0).max()) if len(places) > 1 else 0.0
     if extent == 0:
         return None
     apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
     least = max(extent / 10, APART * apart)
     decade = 10 ** np.floor(np.log10(least))
+    # At 0.99 a least side of 2.01 m still may be 2 m.
     side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)
     return side if side < extent / 2 else None
 
 
 def held_out(data: Measurements, side: float) -> np.ndarray:
-    """Rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
+    """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
         split.check()
@@ -238,7 +247,7 @@ def held_out(data: Measurements, side: float) -> np.ndarray:
 
 
 def proposal(data: Measurements) -> str:
-    """One sentence for `gsparc check`."""
+    """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
     side = side_of_squares(data)
     if side is None or not len(held_out(data, side)):

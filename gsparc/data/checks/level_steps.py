@@ -46,7 +46,7 @@ def level_steps(
     station_position: np.ndarray | None = None,
     most_blocks: int = MOST_BLOCKS,
 ) -> tuple[LevelStep, ...]:
-    """Where the level of one station changes though the places do not explain it.
+    """Find where the level of one station changes though the places do not explain it.
 
     The level is a line in the logarithm of the distance, plus shadowing that is correlated over places
     (exponentially: Gudmundson, Electronics Letters 27, 1991), plus noise, plus a step at an unknown row. For

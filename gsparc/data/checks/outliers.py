@@ -22,7 +22,7 @@ FAR_M = 50.0  # and this much farther: in a small box nothing is far
 
 
 def too_strong(peaks: np.ndarray) -> np.ndarray:
-    """Rows (S,) bool whose largest magnitude `peaks` (S,) is far above all others'; silent rows are not."""
+    """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others'; no silent ones."""
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
     known = np.isfinite(level)
@@ -32,13 +32,13 @@ def too_strong(peaks: np.ndarray) -> np.ndarray:
 
 
 def too_far(positions: np.ndarray) -> np.ndarray:
-    """Rows (S,) bool of `positions` (S, 3) [m] that lie far outside the region of all others."""
+    """Tell which rows (S,) of `positions` (S, 3) [m] lie far outside the region of all others."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
 
 
 def two_groups(places: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Of places (n, 2) [m] those on the far side (n,) bool of a gap, and how wide it is [m].
+    """Return which places (n, 2) [m] lie beyond a gap, (n,) bool, and how wide it is [m].
 
     None unless the gap is ten times as wide as the places on either side, which are not few.
     """
@@ -65,7 +65,7 @@ def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.n
 
 
 def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
+    """Return the largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
     highest = []
     for part in blocks(values):
         magnitude = np.abs(values[part] if mask is None else np.where(mask[part], values[part], 0))
@@ -74,7 +74,7 @@ def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
 
 
 def outliers(data: Measurements) -> dict[str, np.ndarray]:
-    """Rows (n,) by what is wrong with them."""
+    """Return rows (n,) by what is wrong with them."""
     amplitude = peaks(data.target, data.mask)
     amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
     rows_by_fault = {
@@ -85,7 +85,7 @@ def outliers(data: Measurements) -> dict[str, np.ndarray]:
 
 
 def warnings(data: Measurements) -> list[str]:
-    """One sentence for each kind of outlier, with the names of the first rows."""
+    """Say each kind of outlier in one sentence, with the names of the first rows."""
     sentences = []
     for what, rows in outliers(data).items():
         names = some([data.row_names[i] for i in rows])
@@ -99,7 +99,7 @@ APART_M = 200.0  # in height, between a station and all rows
 
 
 def far_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None) -> tuple[str, bool]:
-    """What is wrong with the places of static ends, empty where nothing is, and whether that is certain.
+    """Say what is wrong with the places of static ends, empty: nothing, and whether that is certain.
 
     Args:
         still: (T, 3) places of static ends, in the world [m].

@@ -32,7 +32,7 @@ WEAK_DB = 6.0  # above the weakest value: heard only just
 
 
 def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
-    """All warnings about levels at places.
+    """Return all warnings about levels at places.
 
     Args:
         levels: of powers.
@@ -43,7 +43,7 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
-    """Latitudes and longitudes (n,) [deg] on Earth that may be swapped, or radians."""
+    """Warn of latitudes and longitudes (n,) [deg] on Earth that may be swapped, or radians."""
     where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
     if np.median(latitude) < -60:
         return [f"the places lie in the Antarctic ({where}): latitude and longitude swapped?"]
@@ -55,7 +55,7 @@ def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
 
 
 def level_warnings(level_db: np.ndarray) -> list[str]:
-    """Levels (n,) [dB] that may be linear, percent or indices, or hold marks instead of values."""
+    """Warn of levels (n,) [dB] that may be linear, percent or indices, or hold marks."""
     values = level_db[np.isfinite(level_db)]
     if len(values) < 2:
         return []
@@ -85,14 +85,14 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 
 
 def saturation(values: np.ndarray) -> float | None:
-    """The highest of levels (n,) where it repeats as no level of a receiver does by chance."""
+    """Return the highest of levels (n,) where it repeats as no level of a receiver does by chance."""
     different, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     piled = len(counts) > 1 and counts[-1] > max(SATURATED * counts.sum(), 10, 5 * counts[-2])
     return float(different[-1]) if piled else None
 
 
 def not_heard(values: np.ndarray) -> list[float]:
-    """Of levels (n,) [dB] those that repeat exactly and lie apart from all others: marks, not levels.
+    """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
     At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
     as rows beside a station are strong; at the lower end a pile needs only a gap, as a receiver's own levels
@@ -127,7 +127,7 @@ BETTER, STEEP = 0.3, -0.6  # in the correlation, and the correlation itself
 
 
 def direction_warnings(levels: LinkLevels) -> list[str]:
-    """Levels that rise with the distance from their station, or fall far better from another place."""
+    """Warn of levels that rise with the distance, or fall far better from another place."""
     if levels.station_position is None:
         return []
     places = levels.station_position
@@ -165,7 +165,7 @@ TREND = 0.5  # correlation of a level with the one before: a way, not fading at 
 
 
 def stuck(levels: LinkLevels) -> list[str]:
-    """Places that stand still over many rows while levels change as they do along a way."""
+    """Warn of places that stand still over many rows while levels change as they do along a way."""
     found = []
     for _, used in levels.heard():
         moves = np.flatnonzero((np.diff(levels.position[used], axis=0) != 0).any(axis=1)) + 1
@@ -181,7 +181,7 @@ def stuck(levels: LinkLevels) -> list[str]:
 
 
 def copies(levels: LinkLevels) -> list[str]:
-    """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
+    """Warn of rows of one place and station: copies of equal value, repeated measurements else."""
     import pandas as pd  # here, as it takes half a second
 
     rows = levels.rows
@@ -204,7 +204,7 @@ def copies(levels: LinkLevels) -> list[str]:
 
 
 def wild_rows(levels: LinkLevels) -> list[str]:
-    """Single rows whose level is far from those of the rows before and after them at the same station."""
+    """Warn of single rows whose level is far from those before and after them at the same station."""
     warnings = []
     for t, bad, most in wild_of(levels):
         where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
@@ -214,7 +214,7 @@ def wild_rows(levels: LinkLevels) -> list[str]:
 
 
 def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
-    """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
+    """Return (station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
     outliers = []
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
@@ -232,7 +232,7 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
 
 
 def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
-    """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
+    """Warn of stations whose level changes at a row, unexplained by places (`level_steps`)."""
     names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
         who = f"station {names[t]}" if len(names) > 1 else "the level"
@@ -250,7 +250,7 @@ def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -
 
 
 def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
-    """Stations and their steps, which name rows of `levels`."""
+    """Return stations and their steps, which name rows of `levels`."""
     steps = []
     stations = np.unique(levels.station)
     blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
@@ -264,7 +264,7 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
 
 
 def gaps(levels: LinkLevels) -> list[str]:
-    """Missing levels: long runs of rows (a station was off) and scattered ones (perhaps not heard).
+    """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
 
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
     where fading makes its edges ragged.
@@ -353,13 +353,13 @@ class LinkLevels:
     station_position: np.ndarray | None
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Each station, and its rows (k,) with a value."""
+        """Yield each station, and its rows (k,) with a value."""
         for t in np.unique(self.station):
             yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
 
 
 def link_levels(data: Measurements) -> LinkLevels | None:
-    """Those of powers with one end that stands still; None of anything else."""
+    """Return levels of powers with one end that stands still; None of anything else."""
     site = data.site
     if site.kind != "rssi" or site.static_end is None:
         return None

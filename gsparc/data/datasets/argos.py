@@ -24,6 +24,7 @@ from gsparc.data.schema import Measurements, TrainTest
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
+# OFDM of IEEE 802.11a/g in 20 MHz: 52 tones, 312.5 kHz apart, none at the carrier.
 SPACING_HZ = 312.5e3
 TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
@@ -65,6 +66,7 @@ def load_argos(
     if align:
         csi = aligned(csi, tones)
     scale = rounded_rms(csi)
+    # In complex128, as the reciprocal of a small scale overflows in complex64.
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
     problems = Problems(root)
@@ -89,11 +91,13 @@ def load_argos(
 
 
 def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
-    """Snapshots (S, A, K) without the mean delay and the phase of their uplink (its tones come first)."""
+    """Return snapshots (S, A, K) without mean delay and phase of their uplink (its tones come first)."""
     uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
     step = np.diff(numbers)[0]
+    # Mean phase step between neighbouring tones, weighted by their power: a delay without unwrapping.
     turn = np.angle((uplink[..., 1:] * uplink[..., :-1].conj()).sum((1, 2))) / step
     middle = numbers.mean()
+    # The downlink too: timing and phase offsets belong to the snapshot, not to a band.
     straight = csi * np.exp(-1j * turn[:, None] * (tones - middle))[:, None]
     # The phase of the sum over all antennas and tones.
     phase = np.angle(straight[..., :UPLINK].sum((1, 2)))
@@ -109,6 +113,7 @@ def _channels(root: Path) -> np.ndarray:
         raise DataError(f"{path}: expected {expected}, found {csi.dtype} {csi.shape}")
     for good, fault in (
         (np.isfinite(csi).all((1, 2)), "NaN or Inf; expected finite channels"),
+        # A silent uplink has no phase to align to, and no place to be encoded.
         (np.abs(csi[..., :UPLINK]).any((1, 2)), "its uplink is silent; expected a received packet"),
     ):
         if not good.all():
@@ -126,6 +131,7 @@ def _loaded(path: Path, expected: str) -> np.ndarray:
 
 
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
+    # One description may hold the antennas of the files of 8 and of 64.
     key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
     places = finite(description.get(key))
     if places.shape != (count, 3):
@@ -149,6 +155,7 @@ def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: Tr
         return _true_positions(root / "positions.npy", len(up))
     if of != "encoder" or code is None:
         raise DataError(f"dataset.positions={of!r}: expected encoder or true")
+    # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
     rows = np.arange(len(up)) if split is None else split[0]
     return code(up, rows)
 
@@ -187,7 +194,7 @@ class Argos(Release):
         self.encoder = (room, EncoderSettings(**settings), file)
 
     def read(self, folder: Path) -> Measurements:
-        """Downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
+        """Read downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
         return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
@@ -200,6 +207,6 @@ class ArgosSim(Argos):
         super().__init__(None, name=name, stand_in=stand_in, **rest)
 
     def load(self) -> Measurements:
-        """As `Argos.load`, without a word about the release."""
+        """Load as `Argos.load` does, without a word about the release."""
         assert self.stand_in is not None
         return simulated(self.stand_in, self.called, self.read)

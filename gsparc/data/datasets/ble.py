@@ -70,7 +70,7 @@ def _of_release(root: Path, hall: int) -> Raw:
 
 
 def sensor_places(path: Path) -> dict[str, np.ndarray]:
-    """Places (3,) [m] of the sensors by name, out of `tetam.dev`; DataError where it is another."""
+    """Return places (3,) [m] of the sensors by name, out of `tetam.dev`; DataError where it is another."""
     expected = 'expected a first line Dongles:{"ADDRESS": [[x, y, z], COLOUR, "NAME"], ...}'
     head = read_text(path, f"missing; {expected}").partition("\n")[0]
     try:

@@ -64,7 +64,7 @@ class Campaign(DataModule):
         self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
 
     def raw(self) -> Raw:
-        """The file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
+        """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
         return self.reader(self.file, **self.settings)
 
     def load(self) -> Measurements:
@@ -99,7 +99,7 @@ class StandIn(Protocol):
     """Simulated measurements in a release's layout, handed to the release's module by the configuration."""
 
     def folder(self) -> Path:
-        """Where they are; simulated when they are not there yet.
+        """Return where they are; simulated when they are not there yet.
 
         Raises:
             ValueError: settings that cannot be simulated.
@@ -133,16 +133,16 @@ class Release(DataModule):
         self.stand_in, self.settings = stand_in, settings
 
     def missing(self) -> str:
-        """Why the release is not used, and how to get it."""
+        """Say why the release is not used, and how to get it."""
         root = f"dataset.root={self.root} does not exist" if self.root else "dataset.root is not set"
         return f"{root}: the {self.called} release is NOT on disk. {self.hint}, then set dataset.root=FOLDER."
 
     def read(self, folder: Path) -> Measurements:
-        """A folder in the release's layout; `DataError` where something is missing or wrong."""
+        """Read a folder in the release's layout; `DataError` where something is missing or wrong."""
         return self.reader(folder, **self.settings)
 
     def load(self) -> Measurements:
-        """The release's measurements, or, loudly, the stand-in's."""
+        """Load the release's measurements, or, loudly, the stand-in's."""
         if self.root is not None and self.root.exists():
             return self.read(self.root)
         if self.root is not None or self.stand_in is None:
@@ -152,7 +152,7 @@ class Release(DataModule):
 
 
 def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurements]) -> Measurements:
-    """The measurements of what stands in for the release `called`."""
+    """Return the measurements of what stands in for the release `called`."""
     folder = stand_in.folder()
     layout = f"{called.lower()}-sim: SIMULATED data in the layout of the {called} release"
     log.warning("%s, at %s", layout, folder)
@@ -160,7 +160,7 @@ def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurement
 
 
 def made_once(folder: Path, write: Callable[[Path], None]) -> Path:
-    """The folder, written when it is not there yet."""
+    """Return the folder, written when it is not there yet."""
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
         write(folder)
@@ -168,14 +168,14 @@ def made_once(folder: Path, write: Callable[[Path], None]) -> Path:
 
 
 def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str = "%d") -> None:
-    """The rows' numbers from `first` on, a random fifth of them for testing, in a text file each."""
+    """Write rows' numbers from `first` on, a random fifth of them for testing, in a text file each."""
     order, test = np.random.default_rng(seed).permutation(count) + first, max(round(0.2 * count), 1)
     for name, rows in (("test", order[:test]), ("train", order[test:])):
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
 def read_split(folder: Path, count: int | None, problems: Problems, first: int = 0) -> TrainTest | None:
-    """(train, test) rows from 0 that `train_index.txt` and `test_index.txt` name; None where there are none.
+    """Read (train, test) rows from 0, out of `train_index.txt` and `test_index.txt`; None without them.
 
     Args:
         folder: of the release.
@@ -243,7 +243,7 @@ class Expected:
 
 
 def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> dict[str, np.ndarray]:
-    """The arrays of `layout` by field of the schema; a letter's size is that of the first array that has it.
+    """Return arrays of `layout` by field of the schema; the first array with a letter sets its size.
 
     Raises:
         DataError: all that is missing, of another shape or type, or no place, with array and row.
@@ -273,7 +273,7 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
 
 
 def converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
-    """Arrays of an npz that was made of a release, by field of the schema.
+    """Read arrays of an npz that was made of a release, by field of the schema.
 
     Args:
         path: of the file.

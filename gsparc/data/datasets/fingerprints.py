@@ -60,12 +60,12 @@ class Fingerprints:
     access_point: np.ndarray
 
     def at(self, rows: np.ndarray) -> Fingerprints:
-        """The rows (n,) alone."""
+        """Return the rows (n,) alone."""
         parts = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "access_point"}
         return replace(self, **parts)
 
     def of_access_points(self, names: np.ndarray) -> Fingerprints:
-        """Columns in the order of `names` (P,), as another campaign has them; NaN where they are not here."""
+        """Return columns in the order of `names` (P,) of another campaign; NaN where they are not here."""
         column = {name: number for number, name in enumerate(self.access_point.tolist())}
         columns = np.array([column.get(name, -1) for name in names.tolist()])
         if not (columns >= 0).any():
@@ -75,7 +75,7 @@ class Fingerprints:
 
 
 def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
-    """Rows of an archive or a table; without places, NaN stands for these unless they must be `placed`.
+    """Read rows of an archive or a table; NaN stands for lacking places, unless they must be `placed`.
 
     Example:
         rows = read_fingerprints("wifine-floor4.npz")
@@ -144,7 +144,7 @@ def _of_table(path: Path, placed: bool) -> Raw:
 def parted(
     rows: Fingerprints, how: How = "released", side_m: float = 1.0, share: float = 0.2, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Training and test rows (n,), (m,), sorted; a pure function of its arguments.
+    """Part rows into training and test (n,), (m,), sorted; a pure function of its arguments.
 
     Args:
         how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m` [m];

@@ -68,7 +68,7 @@ def understood(
     frequency_hz: float | Sequence[float] | None = None,
     **conventions: bool | None,
 ) -> Raw:
-    """The same with what settings say of the file.
+    """Return the same with what settings say of the file.
 
     Args:
         raw: as it was read.
@@ -101,6 +101,7 @@ class Own(Campaign):
     """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
 
     choice, reader = "own", staticmethod(raw_of_own)
+    # Arguments of `understood` but its data and its conventions, which are listed by name.
     switches = tuple(inspect.signature(understood).parameters)[1:-1] + tuple(CONVENTIONS)
 
 
@@ -109,12 +110,13 @@ LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind i
 
 
 def campaign_of(raw: Raw) -> str | None:
-    """The choice of conf/dataset that reads a file with these arrays; None where it is of none of them."""
+    """Return the choice of conf/dataset that reads a file with these arrays; None: of none of them."""
+    # By its arrays rather than its name: files are renamed, arrays are not.
     return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
 def release_of(path: Path) -> str | None:
-    """The choice of conf/dataset that reads a file or folder of its makers' release; None where none does."""
+    """Return the choice of conf/dataset that reads a release, file or folder; None where none does."""
     folder = path.is_dir()
     for kind in CAMPAIGNS:
         if path.suffix.lower() in kind.suffixes or (folder and kind.inside and any(path.glob(kind.inside))):
@@ -139,6 +141,7 @@ def read_any(
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
+    # Releases before anything else: their folders may hold tables that look like one's own.
     release = release_of(path)
     if release is not None:
         reading = interpret(LOADERS[release](path), path)
@@ -164,11 +167,12 @@ def raw_of(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
 ) -> Noted:
-    """The arrays of a file of the schema, or of a table, and how its columns were understood.
+    """Read the arrays of a file of the schema, or of a table, and how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
+    # Columns of tables are matched by their heads; arrays of several files may differ in every shape.
     if isinstance(path, Several) and not (cell_m is None and all(is_table(one) for one in path.paths)):
         raise DataError(f"{path}: several files are read as one where all are tables, without dataset.cell_m")
     if cell_m is None and not is_table(path):

@@ -118,7 +118,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
 
 
 def station_places(path: Path) -> dict[str, tuple[float, float]]:
-    """Latitude and longitude [deg] of the stations that stay put, by name.
+    """Return latitude and longitude [deg] of the stations that stay put, by name.
 
     Args:
         path: a table from names to pairs in Python's notation; None stands for a station that drives.

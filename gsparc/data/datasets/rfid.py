@@ -35,7 +35,7 @@ STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
 def planar_array(rows: int = 4, columns: int = 4, spacing_m: float = 0.16) -> np.ndarray:
-    """Element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
+    """Return element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
     x = (np.arange(columns) - (columns - 1) / 2) * spacing_m
     y = (np.arange(rows) - (rows - 1) / 2) * spacing_m
     grid_x, grid_y = np.meshgrid(x, y)
@@ -77,10 +77,12 @@ def load_rfid(
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
     if listed is not None and count is not None:
+        # 160 is shipped with the package: the rows of our tables, whatever was downloaded around them.
         file = files("gsparc.data.public").joinpath("rfid-160.csv") if listed in (160, "160") else listed
         rows, release_split = _read_list(Path(str(file)), count, problems)
     problems.raise_if_any()
     assert info is not None and positions is not None and spectra is not None and count is not None
+    # A simulated replacement has the layout, and says so in `dataset_name` so that tables mark it.
     simulated = info.dataset == STAND_IN
     layout = {} if array is None else array
     places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
@@ -104,6 +106,7 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
     wrong = [
         f"line {i + 2}"
         for i, row in enumerate(cells[1:] if cells else [])
+        # Decimal digits only: `int` alone takes signs, underscores and spaces.
         if len(row) != 2 or not row[0].isdecimal() or not 1 <= int(row[0]) <= count or row[1] not in SPLITS
     ]
     problems.add_rows(path, wrong, f"expected the number of a spectrum, 1 to {count}, and train or test")
@@ -143,6 +146,7 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
         expected = "expected a quaternion of four finite numbers (x, y, z, w)"
         return problems.add(path, f"{name}: orientation is {pose[1]}; {expected}")
     try:
+        # The release prints (x, y, z, w), the schema expects the scalar first.
         rotation = quaternion_to_matrix(orientation, scalar_first=False)
     except ValueError as error:
         return problems.add(path, f"{name}: orientation: {error}")
@@ -156,6 +160,7 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     rows = problems.attempt(lambda: read_csv(path, missing))
     if rows is None:
         return None
+    # Editors leave blank lines at the end; one between rows would shift all images and is refused.
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
@@ -166,12 +171,14 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     positions = np.full((len(rows) - 1, 3), np.nan)
     readable: list[int] = []
     for i, row in enumerate(rows[1:]):
+        # Python's `float` reads `1_0` and digits of other scripts, which no release writes.
         values = [float(cell) for cell in row if NUMBER.fullmatch(cell)]
         if not len(values) == len(row) == 3:
             problems.add(f"{path}, line {i + 2}", f"expected three numbers x,y,z, found {','.join(row)!r}")
             continue
         positions[i] = values
         readable.append(i)
+    # Rows that could not be read are reported above and have NaN, which would be reported twice.
     check_positions(problems, str(path), positions[readable], [f"line {i + 2}" for i in readable])
     return positions
 
@@ -192,6 +199,7 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     problems.add_rows(folder, extra, f"no row for it in tx_pos.csv, which has {count} rows")
     if missing:
         return None
+    # On disk where it is large: the release's 6,123 spectra are 200 MB.
     spectra = empty((count, HEIGHT, WIDTH), np.uint8)
     for i, name in enumerate(expected):
         fault = _read_image(folder / name, spectra[i])
@@ -204,6 +212,7 @@ def _read_image(path: Path, into: np.ndarray) -> str | None:
     """Read one PNG into (90, 360) uint8; returns what is wrong with it."""
     expected = f"expected an 8-bit grey PNG of {WIDTH} x {HEIGHT} pixels"
     try:
+        # The format is fixed: Pillow would otherwise run any of its decoders on a damaged file.
         with Image.open(path, formats=["PNG"]) as image:
             if image.mode != "L":
                 return f"{expected}, found mode {image.mode}"
@@ -226,5 +235,5 @@ class RFID(Release):
     )
 
     def read(self, folder: Path) -> Measurements:
-        """Spectra (S, 90, 360) uint8 of tags that move about a static gateway; stand-ins have no settings."""
+        """Read spectra (S, 90, 360) uint8 of tags about a static gateway; stand-ins have no settings."""
         return super().read(folder) if folder == self.root else load_rfid(folder)

@@ -20,7 +20,7 @@ STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # arr
 
 
 def load_sionna(path: str | Path, target: str | None = None, truth: str | Path | None = None) -> Measurements:
-    """A simulated dataset as spectra, as channels or as powers, the sums of path powers.
+    """Load a simulated dataset as spectra, as channels or as powers, the sums of path powers.
 
     Args:
         path: file that the simulator wrote.
@@ -38,7 +38,7 @@ def load_sionna(path: str | Path, target: str | None = None, truth: str | Path |
 
 
 def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Measurements:
-    """`data` with the targets of `truth` in its test rows; training rows keep their own.
+    """Return `data` with the targets of `truth` in its test rows; training rows keep their own.
 
     Raises:
         DataError: `truth` is not of the same receivers, kind and split.
@@ -83,7 +83,7 @@ def _load(path: str | Path, target: str | None) -> Measurements:
 
 
 def read_as(raw: Raw, target: str) -> Raw:
-    """The same file with one measurement, its array, noise and solver error."""
+    """Return the same file with one measurement, its array, noise and solver error."""
     other = [name for name in ("spectrum", "csi") if name != target]
     arrays = {k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")}
     names = {f"{target}_array_position": "array_position", f"{target}_noise_variance": "noise_variance"}
@@ -133,5 +133,5 @@ class Sionna(DataModule):
         self.file, self.settings = Path(file), settings
 
     def load(self) -> Measurements:
-        """Spectra (S, H, W), channels (S, A, K) or powers (S, 1)."""
+        """Load spectra (S, H, W), channels (S, A, K) or powers (S, 1)."""
         return load_sionna(self.file, **self.settings)

@@ -120,7 +120,7 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
 
 
 def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
-    """Places (T, 3) float64 [m] of the receiving antennas of `hosts` (T,) from Techtile's table.
+    """Return places (T, 3) float64 [m] of the receiving antennas of `hosts` (T,) from Techtile's table.
 
     Args:
         path: YAML with `antennes:`, a list of `tile` and its two `channels` with `x`, `y`, `z` [m].

@@ -80,6 +80,10 @@ def raw_of_wifi_csi(
         np.concatenate([getattr(one, name) for one in logs])
         for name in ("time_s", "sender", "csi", "rssi_dbm", "position")
     )
+    heard = (csi != 0).any(axis=(1, 2))  # a packet of zeros has no level in dB
+    if not heard.all():
+        log.warning("%s: %d packets whose channels are zero are left out", path, (~heard).sum())
+        time, sender, csi, rssi, position = (one[heard] for one in (time, sender, csi, rssi, position))
     tone, csi = _filled(logs[0].tone, csi, path)
     csi, unit = _levelled(csi, rssi, path)
     names, station = np.unique(sender, return_inverse=True)

@@ -81,13 +81,13 @@ def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> 
 
 
 def channel_hz(channel: int) -> float:
-    """Carrier [Hz] of a channel of Wi-Fi at 2.4 or 5 GHz, by its number."""
+    """Return the carrier [Hz] of a channel of Wi-Fi at 2.4 or 5 GHz, by its number."""
     first = 2407 if channel < 14 else 2414 if channel == 14 else 5000
     return 1e6 * (first + 5 * channel)
 
 
 def address(octets: np.ndarray) -> np.ndarray:
-    """Addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
+    """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
     return np.array([":".join(f"{octet:02x}" for octet in one) for one in octets], str)
 
 

@@ -112,7 +112,7 @@ def _of_release(root: Path, transmitters: Mapping[str, Sequence[float]], spacing
 
 
 def read_log(path: Path) -> Log:
-    """Packets of an Intel 5300 with three antennas.
+    """Read packets of an Intel 5300 with three antennas.
 
     Raises:
         DataError: missing, or its records are of another form.
@@ -201,14 +201,14 @@ def _paired(robot: Log, other: Log, sender: np.void) -> tuple[np.ndarray, np.nda
 
 
 def without_slope(csi: np.ndarray) -> np.ndarray:
-    """Channels (n, 30) without the mean slope of their phase over tones: the clocks' delay is in it."""
+    """Return channels (n, 30) without their phase's mean slope over tones, which holds the clocks' delay."""
     even = np.diff(TONES) == 2
     turn = np.angle(np.sum((csi[:, 1:] * csi[:, :-1].conj())[:, even], axis=1)) / 2
     return csi * np.exp(-1j * turn[:, None] * TONES)
 
 
 def followed(square: np.ndarray) -> np.ndarray:
-    """Root (n, K) of a square that changes little from row to row and from tone to tone."""
+    """Return the root (n, K) of a square that changes little from row to row and from tone to tone."""
     root = np.sqrt(square)
     for tone in range(1, root.shape[1]):
         root[0, tone] *= np.where(np.real(root[0, tone] * root[0, tone - 1].conj()) < 0, -1, 1)

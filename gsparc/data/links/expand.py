@@ -42,6 +42,7 @@ def expand(check: Checker, measured: str) -> Links | None:
     if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
         check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
     before = len(check.problems)  # what is already noted does not keep from noting more
+    # Rows without a fix go before the projection: 0, 0 degrees would move its origin far from the site.
     _without_fix(check, measured)
     origin = in_metres(check)
     if len(check.problems) > before or not _heights(check):
@@ -58,6 +59,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     rows = len(arrays[measured]) if arrays[measured].ndim else 0
     run = _run(check, rows)
+    # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
     if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")
         arrays["tx_position"] = np.full(3, np.nan)
@@ -105,11 +107,13 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     if len(check.problems) > before:
         return None
     positions = check.real(f"{moving}_position", (rows, 3))
+    # Without readable positions every row counts as a place; what is wrong with them is noted.
     place = np.arange(rows) if positions is None else numbered(positions)
     if long:
         assert which is not None
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:
+        # A wide row becomes as many rows as there are stations, side by side.
         check.raw = _unrolled(check.raw, measured, count)
         links = Links(
             OTHER[moving], stations, np.tile(np.arange(count), rows), np.repeat(place, count),
@@ -122,6 +126,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         if OTHER[moving] == "tx":
             return check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
         check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
+    # From here on rows have positions of their own, as in a file of one static end.
     for name in STATION_FIELDS:
         check.raw.arrays.pop(name, None)
     if long and check.raw.attributes.get("absent") == "silent":
@@ -138,8 +143,10 @@ def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np
     if measured != "rssi_db":
         check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
     _, first, of_place = np.unique(links.place, return_index=True, return_inverse=True)
+    # Links are numbered place by station, so that those without a row are a set difference.
     lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + links.station)
     station = np.concatenate([links.station, lost % count])
+    # Minus infinity lies below whatever turns out to be the limit of hearing.
     level = np.full(len(lost), -np.inf)
     links = _repeated(check, links, np.r_[:rows, first[lost // count]], station, level)
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
@@ -181,6 +188,7 @@ def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[
     lists = Lists.of(moment, links.station[heard], levels[heard], moving[heard], count)
     if not lists.recognised():
         return links, of_level
+    # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
     floor = np.full(count, levels[heard].min() if level is None else np.min(level))
     if level is not None:
         floor[links.station] = level.reshape(-1)[of_level * (level.size > 1)]
@@ -254,6 +262,7 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
     given = check.raw.attributes.get("not_heard")
     marks = not_heard(values) if given is None else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    # `not_heard=[]` keeps minus infinity as a level, too.
     silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
     floor = "sensitivity_db"
     if level is None and silent.any() and np.isfinite(values[~silent]).any():
@@ -273,6 +282,7 @@ def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndar
     level = saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
     if level is None:
         return np.zeros(len(values), bool)
+    # Both in float32: a file's level may differ from the decimal setting by its rounding.
     above = known & (values.astype(np.float32) >= np.float32(level))
     said = f"{int(above.sum())} of {int(known.sum())} levels are"
     if given == "auto":
@@ -280,6 +290,7 @@ def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndar
         check.notes.append(Caution(f"{said}; dataset.saturation_db=none takes them as measured"))
     else:
         check.notes.append(f"{said} {level:g} dB or more: saturated, taken as at least that")
+    # Saturated rows hold the level itself: that bound is all that is known of them.
     check.raw.arrays["rssi_db"] = np.where(above, level, values)
     return above
 
@@ -294,6 +305,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         return check.refuse("sensitivity_db", f"goes with rssi_db, not with {measured}")
     if measured != "rssi_db" and not isinstance(check.raw.attributes.get("saturation_db", "auto"), str):
         return check.refuse("dataset.saturation_db", f"goes with rssi_db, not with {measured}")
+    # Limits of rows and of stations look alike where the counts agree: then they are of stations.
     by_row = level is not None and level.shape == values.shape != (count,)
     if level is not None and by_row:  # what was heard needs none
         level = np.where(np.isnan(level) & np.isfinite(values), values, level)
@@ -325,6 +337,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         of_row = level if by_row else np.atleast_1d(level)[of_level if level.size > 1 else 0]
         floor = np.broadcast_to(of_row, (len(values),))
         below = ~unknown & marked & (values < floor)
+        # A value under the limit contradicts it: one of the two has another unit or receiver.
         if below.any():
             row = int(np.flatnonzero(below)[0])
             named = links.named([str(name) for name in arrays["row_name"]])[row]
@@ -343,6 +356,7 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
     keep = marked & ~lost
     if silent and values.any():
         keep &= values.any(axis=axes)
+    # As `Measurements.censored`: 1 too weak, -1 too strong, 0 measured.
     side = censored.astype(np.int8) - saturated
     if not (keep & (side == 0)).any():
         why = "nothing was heard in any row" if censored.any() else "nothing was measured"
@@ -426,6 +440,7 @@ def in_metres(check: Checker) -> Georeference | None:
     places = {prefix: _read(check, prefix) for prefix in ("", "station_") if f"{prefix}latitude" in arrays}
     if len(check.problems) > before:
         return None
+    # About the rows rather than the stations: a distant station must not distort the site.
     origin = Georeference.about(*places[""])
     end = _moving(check)
     for prefix, name in (("", end), ("station_", "station")):
@@ -463,6 +478,7 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
         check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
+    # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
     if fault:
         check.refuse(names[0], "row {}: {}".format(*fault))

@@ -38,7 +38,7 @@ class Georeference:
 
     @classmethod
     def about(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
-        """The origin for places (n,) [deg]: their median, rounded to 1e-4 degrees.
+        """Place the origin of (n,) [deg] at their median, rounded to 1e-4 degrees.
 
         Raises:
             DataError: no places, or a value is not in range.
@@ -53,7 +53,7 @@ class Georeference:
         return cls(round(float(np.median(latitude)), DIGITS), round(east, DIGITS))
 
     def from_degrees(self, latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
-        """Local coordinates (n, 2) [m], east and north, of places (n,) [deg].
+        """Return local coordinates (n, 2) [m], east and north, of places (n,) [deg].
 
         Raises:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
@@ -68,7 +68,7 @@ class Georeference:
         return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
 
     def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Latitude and longitude (n,) [deg] of local coordinates (n, 2) [m]; the inverse of `from_degrees`.
+        """Return latitude, longitude (n,) [deg] of local (n, 2) [m]; the inverse of `from_degrees`.
 
         Raises:
             DataError: not finite, of another shape, or farther than half the way round the Earth.
@@ -86,7 +86,7 @@ class Georeference:
 
 
 def bad_degrees(latitude: np.ndarray | float, longitude: np.ndarray | float) -> tuple[int, str] | None:
-    """Row of the first bad one of places (n,) [deg], and what is wrong; None when all are on Earth."""
+    """Return the first row of (n,) [deg] that is not on Earth, and what is wrong; None when all are."""
     latitude, longitude = np.atleast_1d(latitude, longitude)
     for name, values, low, high in (("latitude", latitude, -90, 90), ("longitude", longitude, -180, 360)):
         wrong = np.flatnonzero(~((values >= low) & (values <= high)))

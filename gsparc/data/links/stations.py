@@ -19,7 +19,7 @@ LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end m
 
 
 def station_number(wanted: str | int, names: Sequence[str], count: int) -> int | None:
-    """Which of `count` stations a name or, where none is called by a number, a number from 0 means.
+    """Return which of `count` stations a name, or, if none is called by a number, a number from 0 means.
 
     Args:
         wanted: name or number.
@@ -36,7 +36,7 @@ def station_number(wanted: str | int, names: Sequence[str], count: int) -> int |
 
 
 def numbered(places: np.ndarray) -> np.ndarray:
-    """The number (n,) int64 of each of `places` (n, 3), counted in the order in which they first appear."""
+    """Number each of `places` (n, 3), (n,) int64, in the order in which they first appear."""
     _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
@@ -44,7 +44,7 @@ def numbered(places: np.ndarray) -> np.ndarray:
 
 
 def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | None) -> Links:
-    """Which end stands still, at one place or at few; None for both moving."""
+    """Find which end stands still, at one place or at few; None for both moving."""
     still: dict[End, bool] = {"rx": bool((rx == rx[:1]).all()), "tx": bool((tx == tx[:1]).all())}
     if still["rx"] or still["tx"]:
         return Links("rx" if still["rx"] else "tx", run=run)
@@ -61,7 +61,7 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
 
 
 def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
-    """The table that a file gives; None where something is wrong with it (noted).
+    """Read the table that a file gives; None where something is wrong with it (noted).
 
     Places may be missing, NaN throughout, where powers or channels alone are told by the stations.
     """
@@ -99,7 +99,7 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
 
 
 def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
-    """(S,) int64, the station of every row."""
+    """Return the station (S,) int64 of every row."""
     index = check.array("station", (rows,))
     if index is None:
         return None
@@ -133,7 +133,7 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
 
 
 def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int, hopping: bool) -> Links:
-    """Stations at several carriers as one station for each; where `hopping`, carriers of a band are one."""
+    """Part stations at several carriers, one for each; where `hopping`, carriers of a band are one."""
     assert links.stations is not None and links.station is not None
     if carriers is None or carriers.ndim == 0:
         return links

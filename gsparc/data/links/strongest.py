@@ -63,7 +63,7 @@ class Lists:
 
     @classmethod
     def of(cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int) -> Lists:
-        """Of rows (n,) of `lists`, stations `who` of `count`, levels [dB] and places `at` (n, 3) [m]."""
+        """Build from rows (n,) of `lists`, stations `who` of `count`, levels [dB], places `at` (n, 3) [m]."""
         number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
         table[which.reshape(-1), who] = level
@@ -75,7 +75,7 @@ class Lists:
         return np.isfinite(self.level).sum(1) == self.length
 
     def recognised(self) -> bool:
-        """Whether many hold as many as any, fewer than there are, and stations drop out of them when weak."""
+        """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak."""
         moments_, count = self.level.shape
         sizes = np.isfinite(self.level).sum(1)
         piled = self.full.mean() >= FULL and self.full.sum() > (sizes == self.length - 1).sum()
@@ -91,7 +91,7 @@ class Lists:
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
     def unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
-        """Moments (m,), stations (m,) and levels (m,) [dB] that these are below.
+        """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong
         stations are that are seldom listed. The rest tell most: a row does where the nearest that lists its

@@ -68,7 +68,7 @@ class PublicSet:
         return f"{total / 1e6:.1f} MB in {len(self.sources)} file{'s' * (len(self.sources) > 1)}"
 
     def files(self) -> dict[Path, Source]:
-        """Sources by the path they are stored at.
+        """Return sources by the path they are stored at.
 
         Raises:
             DataError: a path that leaves the set's folder.
@@ -76,19 +76,21 @@ class PublicSet:
         placed, top = {}, self.folder.resolve()
         for source in self.sources:
             path = self.folder / source.path.removeprefix(f"{self.strip}/")
+            # On Windows a backslash parts folders as well, and could lead out of this one.
             if not path.resolve().is_relative_to(top) or "\\" in source.path:
                 raise DataError(f"{self.name}: {source.path} would leave {self.folder}; nothing is fetched")
             placed[path] = source
         return placed
 
     def missing(self) -> list[Path]:
-        """Files that are not there in full size."""
+        """Return files that are not there in full size."""
+        # By size alone: hashes are checked when files are fetched, and reading all at each start takes long.
         return [p for p, one in self.files().items() if not p.is_file() or p.stat().st_size != one.bytes]
 
 
 @cache
 def public_sets() -> dict[str, PublicSet]:
-    """Every public set by its name."""
+    """Return every public set by its name."""
     sources: dict[str, list[Source]] = {}
     for row in shipped("gsparc.data.public", "sources.csv"):
         place = row["repository"], row["revision"], row["path"]
@@ -96,6 +98,7 @@ def public_sets() -> dict[str, PublicSet]:
     about = yaml.safe_load(files("gsparc.data.public").joinpath("sets.yaml").read_text(encoding="utf-8"))
     sets = {}
     for name, facts in about.items():
+        # Several sets may share the files of one release (`of`), each with its own part (`match`).
         pinned, match = sources.get(facts.pop("of", name), ()), facts.pop("match", "*")
         chosen = tuple(source for source in pinned if fnmatchcase(source.path, match))
         sets[name] = PublicSet(name, by_hand=facts.pop("from", None), **facts, sources=chosen)
@@ -103,7 +106,7 @@ def public_sets() -> dict[str, PublicSet]:
 
 
 def fetched(choice: str, setting: str = "file") -> Path:
-    """What `dataset=<choice>` reads where its setting names nothing: the set as it was fetched.
+    """Return what `dataset=<choice>` reads where its setting names nothing: the set as it was fetched.
 
     Raises:
         DataError: nothing is fetched, or only a part; says in one line how to get it.
@@ -122,7 +125,7 @@ def fetched(choice: str, setting: str = "file") -> Path:
 
 
 def found(choice: str) -> Path | None:
-    """As `fetched`; None where it is not there."""
+    """Return the same as `fetched`; None where it is not there."""
     try:
         return fetched(choice)
     except DataError:

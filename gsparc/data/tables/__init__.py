@@ -12,5 +12,5 @@ TABLE_SUFFIXES = (*TEXT_SUFFIXES, ".parquet")
 
 
 def is_table(path: str | Path) -> bool:
-    """Whether a file's name says that it is one."""
+    """Tell whether a file's name says that it is one."""
     return Path(path).suffix.lower() in TABLE_SUFFIXES

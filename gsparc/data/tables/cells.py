@@ -20,7 +20,7 @@ CHUNK = {"batch_readahead": 2, "fragment_readahead": 1}  # of 131,072 rows and o
 
 
 def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
-    """A row for each cell of places, and value of any other column: means of levels [dB] and coordinates.
+    """Merge rows by cell of places and values of other columns: means of levels [dB] and coordinates.
 
     Rows without a level are apart from those with one, as they were not heard. Memory grows with cells, not
     with rows; the order is that of the first rows.

@@ -25,6 +25,7 @@ MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS
 ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
 LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
 _STATIONS = "|".join(sorted(heads.STATION_WORDS))
+# A letter or a number that remains of a head names a station; a whole word says another quantity.
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
 REPEATED = 4  # rows for each name of a column that may hold stations
 
@@ -44,7 +45,7 @@ class Column(Head):
     value: tuple[float, ...] = ()
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
-        """(S,) float64 in the schema's unit, NaN where there is no value; None, and noted, where unusable."""
+        """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not suits(self.role, self.unit):
@@ -64,7 +65,7 @@ def choose(
     labelled: Iterable[str] = (),
     only: Container[str] | None = None,
 ) -> tuple[Chosen, list[str]]:
-    """The columns of each quantity, and a note for each that was guessed.
+    """Choose the columns of each quantity, with a note for each that was guessed.
 
     Args:
         sheet: the table.
@@ -77,6 +78,7 @@ def choose(
     for key, value in settings.items():
         columns = () if value is None else _by_setting(sheet, key, value)
         if columns:
+            # Settings come first: what is said needs no guess, and its column is not guessed again.
             chosen[columns[0].role] = columns
     if sheet.problems:
         return chosen, []
@@ -88,28 +90,36 @@ def choose(
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
         areas = heads.TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
+        # `ci` is a cell identity only beside an area code: alone it may be a confidence interval.
         alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
+        # What was said of one way (metres) rules out guesses of another (degrees) for the same end.
         if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
             continue
         if meaning.strange:
             expected = known(KINDS[role])
             sheet.refuse(f"[{meaning.strange}] is no known unit; expected one of {expected}", head)
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
+    # First of all, as a second measurement is no second candidate for the first one.
     _one_way(sheet, guesses)
     notes = []
     for role, found in guesses.items():
+        # Columns whose head says less than others of the quantity count only where there is nothing better.
         candidates = [column for column in found if not column.less] or found
         if role == "station":
             candidates = _identity(sheet, candidates, always=only is not None)
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
+        # With a column of stations a row is of one: several columns of levels would contradict it.
         one_each = tones or "station" not in {**chosen, **guesses}
         several = role in heads.MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
+        # Columns of different words (`rssi_1`, `power_2`) are no family of stations.
         several &= len({column.word for column in candidates}) == 1
         several |= role == "station" and candidates[0].label == JOINED
+        # A head spelt as in the schema is a statement, no guess.
         exact = [column for column in candidates if column.head == role]
         if len(candidates) > 1 and not several and not exact:
             _ambiguous(sheet, role, candidates)
             continue
+        # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
         if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled):
             fault = "a received level or power, or something else? if it is one, say "
             sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
@@ -121,6 +131,7 @@ def choose(
         if not column.word and column.unit is not None and column.unit.changes:
             notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
     _one_unit(sheet, chosen)
+    # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
         notes += _wide_survey(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
@@ -145,6 +156,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
         for head in more:
             longer = [*columns, replace(first, head=head)]
             fewer, many = (len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer))
+            # A column that tells rows rather than stations apart has nearly as many values as there are rows.
             if always or fewer < many <= len(sheet) // REPEATED:
                 columns = longer
         return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
@@ -152,6 +164,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
 
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
+# With a number behind the word: `AP1` is a station's levels, `ap` a column of their names.
 NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS})[\W_]*[a-z]?\d+[\W_]*$")
 
 
@@ -180,11 +193,13 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
                 notes.append(Caution(f"column {head!r}: floors as heights in metres? {say}"))
             continue
         wanted = have.get(topic)
+        # Heights are said per end or for the end without a name; either is enough.
         if wanted in chosen or (wanted == "z" and {"rx_z", "tx_z"} & set(chosen)):
             continue
         words = sheet.words(head)
         pairs = {pair for pair in zip(names.tolist(), words.tolist(), strict=True) if pair[1]}
         groups = len({name for name, _ in pairs}) if wanted != "z" else 1
+        # A column matters where one station has several values of it, with rows enough for each.
         if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
             joined = "+".join([*(column.head or "" for column in stations), head])
             how = heads.SHEET["remedies"][topic].format(head=head, joined=joined)
@@ -202,6 +217,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
+    # A factor, as in `pathloss*-1`, is looked for after the head as it is: heads may hold a `*`.
     times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
     head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None
     if times and head is not None:
@@ -213,6 +229,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
         return tuple(Column(role, JOINED, head=part) for part in joined)
     if "*" in text and role in heads.MANY:
         named = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
+        # A pattern has one star: what it stands for in a head is the name of the station or tone.
         before, _, after = text.partition("*")
         labels = [h[len(before) : len(h) - len(after)] for h in named]
         if named and "*" not in after:
@@ -221,6 +238,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
             return tuple(Column(role, label, _unit(h, role), head=h) for h, label in pairs)
         fault = "expected one * only" if "*" in after else "no column is called so"
         return sheet.problems.add(where, fault) or ()
+    # `FIRST:LAST` of frequencies, or one number for all rows; other text becomes NaN and no constant.
     numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
@@ -236,6 +254,7 @@ def _head(sheet: Sheet, text: str) -> str | None:
     if text in sheet.heads:
         return text
     words = words_of(text)
+    # Case, spaces and a unit in brackets are layout; where two heads differ in them alone, none is meant.
     alike = [h for h in sheet.heads if words and words in (words_of(h), words_of(unit_of(h)[0]))]
     return alike[0] if len(alike) == 1 else None
 
@@ -280,6 +299,7 @@ def _is_plain(column: Column, stations: Container[str]) -> bool:
 def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     """Refuse a column in another unit than the schema's beside one of its kind that says none."""
     for kind in SCHEMA:
+        # Kinds rather than quantities: a position in mm beside another axis without a unit mixes both.
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
         turned = [c for c in columns if c.unit is not None and c.unit.changes and c.unit.name[:2] != "x "]
         silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
@@ -326,13 +346,14 @@ def _note(columns: tuple[Column, ...]) -> str:
 
 
 def schema_unit(column: Column) -> str:
-    """Unit of the column's values once they are read."""
+    """Return the unit of the column's values once they are read."""
     unit = SCHEMA.get(KINDS[column.role], "deg")
+    # dB are levels without a reference; calling them dBm would invent one.
     return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
 
 
 def as_station(column: Column) -> Column:
-    """The same column of a list of stations, where ends need not be named."""
+    """Return the same column of a list of stations, where ends need not be named."""
     axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
     return column if axis is None else replace(column, role=f"station_{axis}")
 

@@ -32,7 +32,7 @@ OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long 
 
 
 def by_word(table: str) -> dict[str, str]:
-    """Which entry of a table of words.yaml each of its words stands for."""
+    """Return which entry of a table of words.yaml each of its words stands for."""
     return {word: meaning for meaning, words in SHEET[table].items() for word in words.split()}
 
 
@@ -67,7 +67,7 @@ class Head:
 
 
 def about(head: str) -> str | None:
-    """Of which of the topics a head speaks; None: of none."""
+    """Tell of which of the topics a head speaks; None: of none."""
     words = words_of(unit_of(head)[0])
     topics = (_TOPIC[word] for word in words if word in _TOPIC)
     return None if LISTS["accuracy"] & set(words) else next(topics, None)
@@ -91,12 +91,12 @@ def understand(text: str) -> Head:
 
 
 def suits(role: str, unit: Unit) -> bool:
-    """Whether a column of `role` can be in `unit`."""
+    """Tell whether a column of `role` can be in `unit`."""
     return KINDS[role] == unit.kind or (KINDS[role], unit.kind) == ("phase", "angle")
 
 
 def unit_of(text: str) -> tuple[str, Unit | None, str]:
-    """A head without its unit, the unit, and text in square brackets that is no known unit."""
+    """Return a head without its unit, the unit, and text in square brackets that is no known unit."""
     match = re.search(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\)|/\s*([^\s/]+))\s*$", text)
     if match is None:
         return text, None, ""
@@ -111,7 +111,7 @@ def unit_of(text: str) -> tuple[str, Unit | None, str]:
 
 
 def words_of(text: str) -> list[str]:
-    """Small words of a head: `RxPower_mean` is rx, power, mean."""
+    """Split a head into small words: `RxPower_mean` is rx, power, mean."""
     text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
     apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)

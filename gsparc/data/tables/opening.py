@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def opened(source: str) -> Iterator[Dataset]:
-    """The dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
+    """Open the dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
 
     Raises:
         DataError: pyarrow is missing, or a file is damaged, also while it is read in the block.
@@ -44,7 +44,7 @@ def opened(source: str) -> Iterator[Dataset]:
 
 
 def read_parquet(source: str, most: int | None = None) -> Sheet:
-    """The columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
+    """Read columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
     with opened(source) as files:
         frame = (files.to_table() if most is None else files.head(most)).to_pandas()
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
@@ -77,7 +77,7 @@ Lines = dict[int, str]  # those with something in them, by their numbers from 1
 
 
 def read_text(path: Path) -> tuple[Sheet, list[str]]:
-    """The cells of a text file, and notes on what was recognised.
+    """Read the cells of a text file, with notes on what was recognised.
 
     Raises:
         DataError: empty, not text, no heads, ragged lines or two columns of one name.
@@ -328,7 +328,7 @@ def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[
 
 
 def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
-    """The cells of a table, and notes on what was recognised.
+    """Read the cells of a table, with notes on what was recognised.
 
     Args:
         path: of the table.

@@ -15,6 +15,7 @@ from gsparc.data.tables.sectors import TILTS, meaning, read_sectors, sites_of
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
+# Both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))  # degrees of latitude and longitude
 
 
@@ -33,16 +34,16 @@ class Places:
     degrees: bool
 
     def all(self) -> np.ndarray:
-        """(n, 2) or (n, 3)."""
+        """Return (n, 2) or (n, 3)."""
         return self.across if self.height is None else np.column_stack([self.across, self.height])
 
     def take(self, rows: np.ndarray) -> Places:
-        """Those of some rows."""
+        """Return those of some rows."""
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
 def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
-    """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it.
+    """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
 
     Where places may be `unknown`, rows without any coordinate are NaN.
     """
@@ -81,8 +82,10 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np
 
 def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
     """What numbers (n,) that are no decimal degrees are instead; None: metres, it seems."""
+    # ddmm.mmmm is about a hundred times the degrees; minutes, its last two whole digits, are below 60.
     if max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100 and (np.abs([lat, lon]) % 100 < 60).all():
         return "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert them"
+    # Receivers store degrees as integers in units of 1e-7: 1e7 is one degree, 9e8 the pole.
     whole = np.abs(lat).min() >= 1e7 and np.abs(lat).max() <= 9e8 and np.abs(lon).max() <= 1.8e9
     return "degrees times ten million; divide them" if whole else None
 
@@ -92,6 +95,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
     outside = [np.flatnonzero((values < low) | (values > high)) for values, (low, high) in limits]
     swapped = len(outside[0]) > 0 and (np.abs(across[:, 1]) <= 90).all()
     heads = [chosen[role][0].head or "" for role in roles]
+    # Where most rows are outside, the columns are no degrees; else these rows are faulty.
     if 2 * len(outside[0]) > len(across) and not swapped:
         end = roles[0].removesuffix("latitude")
         metres = f"metres? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
@@ -109,7 +113,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
 def one_each(
     sheet: Sheet, row_places: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
 ) -> Places | None:
-    """The place of each station, which must be the same in all its rows; None, and noted, when it is not.
+    """Return the place of each station, the same in all its rows; None, and noted, when it is not.
 
     Args:
         sheet: for the names of rows.
@@ -120,6 +124,7 @@ def one_each(
     """
     values = row_places.all()
     fixed = (values[:, :2] != 0).any(axis=1)  # 0, 0 in some of a station's rows: no fix there
+    # The station's first row with a fix, or its first row where none has one.
     first = np.array([int(np.argmax((station == t) * (1 + fixed))) for t in range(len(names))])
     moved = np.flatnonzero((values != values[first[station]]).any(axis=1) & fixed)
     if len(moved) == 0:
@@ -155,15 +160,17 @@ class StationList:
     aliases: tuple[tuple[str, ...], ...] = ()
 
     def called(self, words: np.ndarray) -> StationList:
-        """The same under the names that most of words (S,) are of, its own first."""
+        """Return the same under the names that most of words (S,) are of, its own first."""
         known = set(words.tolist())
+        # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
         return replace(self, names=names)
 
     def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
-        """The same with those of words (S,) that it lacks, if few, at unknown places; these, and a note."""
+        """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
         names = [word for word in dict.fromkeys(words.tolist()) if word]
         lost = [word for word in names if word not in self.names]
+        # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
         if not lost or len(names) < LEAST_LISTED or len(names) < 3 * len(lost):
             return self, [], []
         rows, more = int(np.isin(words, lost).sum()), len(lost)
@@ -171,6 +178,7 @@ class StationList:
         height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
         across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
         extra = {
+            # Of what a list says besides, only facts of sectors may be unknown (`Stations.sector`).
             name: np.r_[array, np.full(more, np.nan if name in SECTOR else array[0])]
             for name, array in self.extra.items()
         }
@@ -180,7 +188,7 @@ class StationList:
 
 
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
-    """The stations of a table: name, and x, y, z or latitude, longitude, height, empty where nobody knows."""
+    """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
     naming = [head for head in sheet.heads if head and understand(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
@@ -209,6 +217,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         return None, notes
     names = sheet.joined(c.head for c in chosen["station"])
     other = [each for each in (_named(sheet, heads) for heads in aliases) if len(set(each)) == len(each)]
+    # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
     if other and len(set(names.tolist())) < len(names) and (names != "").all():
         names = np.array(other[0])
     for i in np.flatnonzero(names == ""):

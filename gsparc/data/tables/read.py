@@ -36,7 +36,7 @@ def understand_table(
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
 ) -> Noted:
-    """The arrays of a table, and what was guessed.
+    """Read the arrays of a table, and what was guessed.
 
     Args:
         path: *.csv, *.tsv, *.txt or *.parquet, or several.
@@ -48,6 +48,7 @@ def understand_table(
     Raises:
         DataError: all problems, with row and column.
     """
+    # Of Parquet with cells only the first rows are read here: `merged` streams the file in chunks.
     sheet, notes = sheet_of(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
     sheet, unfolding = unfolded(sheet, {str(value) for value in columns.values()})
     notes = [*notes, *unfolding]
@@ -57,7 +58,9 @@ def understand_table(
         listed, list_notes = read_stations(second)
         notes += list_notes
         sheet.problems.raise_if_any()
+    # The list of stations comes before the columns: heads that equal its names are levels of stations.
     chosen, guessed = choose(sheet, columns, () if listed is None else listed.names)
+    # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
     if cell_m is not None:
         chosen.pop("row_name", None)  # rows of a cell have many
@@ -89,8 +92,9 @@ class Builder:
         self.tones, self.zones = np.zeros(1, int), ""
 
     def build(self) -> dict[str, np.ndarray]:
-        """All arrays; what is wrong is in `sheet.problems`."""
+        """Return all arrays; what is wrong is in `sheet.problems`."""
         measured = self._measurement()
+        # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
         self._frequency(channels="csi" in self.arrays)
         if "sensitivity_db" in self.chosen:
@@ -98,6 +102,7 @@ class Builder:
         for role in ("run", "row_name"):
             if role in self.chosen:
                 self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
+        # Without names rows are called by their line in the file, so that messages survive dropped rows.
         self.arrays.setdefault("row_name", np.array(self.sheet.rows))
         return self.arrays
 
@@ -120,6 +125,7 @@ class Builder:
         if any(values is None for values in levels):
             return role
         values = np.stack([v for v in levels if v is not None], axis=1)
+        # Tells an empty column from a bad value: one message instead of one a row.
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
         for text, count in self.sheet.marks.items():
@@ -127,6 +133,7 @@ class Builder:
             self.notes.append(Caution(f"{said}, below the weakest; dataset.not_heard=[] refuses them"))
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
+        # Received levels in dBm are below 0: a column without one is a power, a share, or lost its sign.
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
             choices = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
             fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
@@ -137,6 +144,7 @@ class Builder:
     def _channels(self, names: tuple[str, str]) -> None:
         """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
         pairs = [self._tones(part) for part in names]
+        # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         parts: list[list[np.ndarray]] = [[], []]
         for tone in self.tones.tolist():
@@ -152,6 +160,7 @@ class Builder:
             return
         first, second = (np.stack(part, axis=1) for part in parts)
         if names == POLAR:
+            # A unit in the head has turned values into degrees by now; without one, over a turn is no radian.
             degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
             if pairs[1][self.tones[0]].unit is None:
                 self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
@@ -169,6 +178,7 @@ class Builder:
         for column in self.chosen.get(part, ()):
             label = column.label.strip(" _.:()[]")
             where = self.sheet.where(column.head or "")
+            # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
                 self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
@@ -186,6 +196,7 @@ class Builder:
         if not ends:
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .latitude, .longitude")
+        # Two named ends and one without a name: nothing says which of the named ones it would replace.
         if len(ends) == 3:
             fault = "coordinates of rx, of tx and of an end without a name"
             return self.refuse(f"{fault}; expected two ends, rename one")
@@ -197,6 +208,7 @@ class Builder:
         self.zones = self._zones(where)
         if stations is not None:
             self._add_stations(stations, where.degrees)
+        # Warnings need the level and the station of each row, so both are known before.
         self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
         for other in ends.values():  # the end that is left, where there are no stations
@@ -205,6 +217,7 @@ class Builder:
     def _unused(self) -> dict[str, np.ndarray]:
         """Text (S,) of the columns that are not used, those of one value left out."""
         used = {column.head for columns in self.chosen.values() for column in columns}
+        # A column of one value tells nothing apart, whatever it is called.
         words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
         return {head: text for head, text in words.items() if (text != text[0]).any()}
 
@@ -215,6 +228,7 @@ class Builder:
             return ""
         for head, words in self._unused().items():
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
+            # A tenth of the rows: columns with more values number rows or times rather than places.
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
                 return head
         return ""
@@ -225,6 +239,7 @@ class Builder:
             return
         level = self.arrays[measured]
         station = np.zeros(len(level), int) if station is None else station
+        # A degree of longitude is shorter than one of latitude, by the cosine of the latitude.
         stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
         names = [column.head or "" for column in self.chosen.get("station", ())]
         for head, said in splitting(where.across * [1, stretch], level, station, self._unused()):
@@ -236,6 +251,7 @@ class Builder:
         named: list[str] = [end for end in ("rx_", "tx_") if end in ends]
         if "" in ends:
             named = named or [stay] * bool(stay)
+            # The end without a name is whichever the named one is not; unsaid, it is the receiver.
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
             if not named and station and station[0].word in LISTS["hearing"]:
@@ -246,6 +262,7 @@ class Builder:
                 rename = f"if not, name them {other}_{axis}, ..., or say dataset.columns.{other}_{axis}=..."
                 self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
             return moving, ends.pop("")
+        # Both ends are named and the receiver never moves: the rows are places of the transmitter.
         if len(named) == 2 and len(np.unique(ends["rx_"].all(), axis=0)) == 1:
             named = ["tx_"]
         return named[0][:2], ends.pop(named[0])
@@ -260,6 +277,7 @@ class Builder:
             return self._wide(labels, where, next(iter(end_places.values())).degrees)
         columns = self.chosen.get("station", ())
         if not columns:
+            # A list of one station needs no column: every row can only be of it.
             if self.listed is not None and len(self.listed.names) == 1:
                 return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
             if self.listed is not None:
@@ -273,6 +291,7 @@ class Builder:
             plain = self.sheet.words(head)
             listed, joined = self.listed.called(plain), self.listed.called(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
+            # Where the list knows the names without what other columns add to them, these are taken.
             words = plain if exact and set(plain) <= set(listed.names) else words
             self.listed = listed if words is plain else joined
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
@@ -289,6 +308,7 @@ class Builder:
             return None
         ends = [end for end in ("tx_", "rx_") if end in end_places] if len(end_places) > 1 else []
         for end in ends:
+            # A place that differs among a station's rows is no error yet: the other end may be the station's.
             each = one_each(self.sheet, end_places[end], index, names, ask=True)
             if each is not None:
                 end_places.pop(end)
@@ -303,6 +323,7 @@ class Builder:
 
     def _rounded(self, words: np.ndarray, head: str) -> None:
         """Warn of names that a spreadsheet has rounded: several stations may have become one."""
+        # Spreadsheets keep 15 digits of a number: longer ones, like cell identities, then end in zeros.
         lost = sorted({w for w in words.tolist() if re.fullmatch(r"\d(?:[.,]\d+)?E\+\d+|\d{15}0{2,}", w)})
         if lost:
             said = f"column {head!r}: {some(lost, 3)}: rounded by a spreadsheet, stations may have become one"
@@ -324,12 +345,14 @@ class Builder:
         silent = [name for name in self.listed.names if name not in labels]
         used = {column.head for columns in self.chosen.values() for column in columns}
         for name in silent:
+            # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
             close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
             for head in close:
                 self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
         self._note_silent("without a column", silent)
+        # The list's order and that of the columns differ: levels stay, facts of stations are reordered.
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
             if role in self.listed.extra:
@@ -368,12 +391,14 @@ class Builder:
         """Of two ends in degrees, the one with fewer places, which are then stations."""
         if len(ends) < 2 or not all(where.degrees for where in ends.values()):
             return None
+        # Stations are fewer than the places that were measured at, whichever end they are.
         few = min(ends, key=lambda end: len(np.unique(ends[end].all(), axis=0)))
         return ends.pop(few)
 
     def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""
         values, index = np.unique(where.all(), axis=0, return_inverse=True)
+        # A station for each row or two would be a moving end taken for stations.
         if len(values) > max(1, len(self.sheet) // 2):
             fault = f"{len(values)} places of stations in {len(self.sheet)} rows"
             return self.refuse(f"{fault}; stations stay where they are")
@@ -404,6 +429,7 @@ class Builder:
         height = where.height
         if height is None:
             self.notes.append(f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m")
+        # Equal heights are kept as one: schema arrays of shape () hold for all rows.
         elif len(np.unique(height)) == 1:
             height = height[:1]
         flat = np.array(UNKNOWN_HEIGHT) if height is None else height[0] if len(height) == 1 else height
@@ -439,6 +465,7 @@ class Builder:
                 if not channels or len(self.tones) == 1:
                     fault = f"two frequencies {column.value} for one tone"
                     return self.refuse(f"dataset.columns.frequency_hz: {fault}")
+                # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
                 self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], column.value)
                 if np.ptp(np.diff(self.tones)):
                     self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
@@ -451,11 +478,14 @@ class Builder:
         if values is None:
             return
         unknown = np.flatnonzero(np.isnan(values))
+        # Stations are told apart by their carriers: a row without one would be of none.
         self.sheet.refuse_rows(column.head, unknown, "no value; expected a frequency")
+        # Numbers of 100 to 1e5 without a unit are MHz in the logs of phones and scanners; GHz are below 100.
         if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
             values = 1e6 * values
             self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
         same = len(np.unique(values)) == 1
         self.arrays["carrier_hz"] = values[0] if same else values
+        # Only a single tone lies at the carrier itself.
         if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
             self.arrays["frequency_hz"] = values[0]

@@ -19,26 +19,26 @@ MHZ = 1e6
 
 
 def meaning(head: str) -> str | None:
-    """What a head of a list says of a sector; None: nothing."""
+    """Return what a head of a list says of a sector; None: nothing."""
     words = " ".join(word for word in words_of(unit_of(head)[0]) if word not in LISTS["sector_beside"])
     return HEADS.get(words)
 
 
 def earfcn_hz(channel: np.ndarray) -> np.ndarray:
-    """Downlink frequencies (n,) [Hz] of LTE channel numbers (n,), NaN of none (3GPP TS 36.101, 5.7.3)."""
+    """Return downlink frequencies [Hz] of LTE channel numbers (n,), NaN of none (3GPP TS 36.101, 5.7.3)."""
     lowest, first = BANDS.sort_values("first_earfcn").to_numpy().T
     at = np.searchsorted(first, np.nan_to_num(channel, nan=-1), side="right") - 1
     return np.where(at >= 0, (lowest[at] + 0.1 * (channel - first[at])) * MHZ, np.nan)
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:
-    """Lowest downlink frequencies (n,) [Hz] of LTE bands (n,), or of frequencies [MHz] that name one."""
+    """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one."""
     known = BANDS["lowest_mhz"].reindex(np.nan_to_num(band).astype(int)).to_numpy()
     return np.where(band > MOST_BAND, band, known) * MHZ
 
 
 def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Arrays (T,) by name of what a list says of its sectors, `height` and `carrier_hz` among them; notes.
+    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them, and notes.
 
     Args:
         sheet: the list.
@@ -82,7 +82,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
 
 
 def sites_of(sheet: Sheet) -> np.ndarray | None:
-    """Numbers (T,) float64 of the sites that a column of the list names; None where none does."""
+    """Number (T,) float64 the sites that a column of the list names; None where none does."""
     for head in sheet.heads:
         words = sheet.words(head) if head and " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
         number, names = pd.factorize(words)

@@ -50,11 +50,11 @@ class Sheet:
         return len(self.rows)
 
     def first_heads(self) -> str:
-        """The first heads, for messages."""
+        """Return the first heads, for messages."""
         return ", ".join(repr(head) for head in self.heads[:8] if head)
 
     def where(self, head: str) -> str:
-        """How messages name a column."""
+        """Say how messages name a column."""
         return f"{self.source}, column {head!r}"
 
     def refuse(self, what: str, head: str | None = None) -> Any:
@@ -66,7 +66,7 @@ class Sheet:
         return self.problems.add_rows(self.where(head or ""), (self.rows[i] for i in rows), what)
 
     def words(self, head: str) -> np.ndarray:
-        """Text (S,) of a column, without surrounding spaces; empty where there is no value."""
+        """Return text (S,) of a column, without surrounding spaces; empty where there is no value."""
         column = self.columns[self.heads.index(head)]
         missing = column.isna().to_numpy()
         if pd.api.types.is_float_dtype(column.dtype) and (column[~missing] % 1 == 0).all():
@@ -76,7 +76,7 @@ class Sheet:
         return np.where(empty, "", text).astype(str)
 
     def joined(self, heads: Iterable[str | None]) -> np.ndarray:
-        """Text (S,) of several columns together; empty where the first is."""
+        """Return text (S,) of several columns together; empty where the first is."""
         parts = [self.words(head or "") for head in heads]
         names = [" ".join(filter(None, row)) if row[0] else "" for row in zip(*parts, strict=True)]
         return np.array(names, dtype=str)
@@ -88,7 +88,7 @@ class Sheet:
         suits: Callable[[Unit], bool] = lambda unit: False,
         levels: bool = False,
     ) -> np.ndarray | None:
-        """Numbers (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text.
+        """Read (S,) float64 of a column, NaN for no value; None, and noted, where a cell is text.
 
         Args:
             head: of the column.

@@ -17,7 +17,7 @@ NEEDED, LEAST = {"PCI", "RSRP"}, 2  # of a slot; slots
 
 
 def slots_of(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    """Heads of each slot by what they hold, by the slot's name; empty where there are not several."""
+    """Return heads of each slot by what they hold, by the slot's name; empty where there are not several."""
     found: dict[str, dict[str, str]] = {}
     for head in heads:
         words = words_of(unit_of(head)[0]) if head else []
@@ -30,7 +30,7 @@ def slots_of(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
 
 
 def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
-    """A row for each slot that holds a cell and its level, rows of one moment together, and a note.
+    """Return a row per slot with a cell and its level, rows of one moment together, and a note.
 
     Args:
         sheet: the table.

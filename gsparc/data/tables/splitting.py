@@ -22,7 +22,7 @@ NEAREST = 0.01  # of the extent: nearer, a law of distance rises no more
 def splitting(
     places: np.ndarray, level: np.ndarray, station: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> Iterator[tuple[str, str]]:
-    """Columns whose groups have levels or places of their own, and how that shows.
+    """Find columns whose groups have levels or places of their own, and how that shows.
 
     Args:
         places: (n, 2), in one unit along both axes.
@@ -46,7 +46,7 @@ def splitting(
 
 
 def levels_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> float:
-    """How much more levels (n,) [dB] differ between neighbours (n, 2) of two groups than of one, median."""
+    """Return how much more levels (n,) [dB] of neighbours (n, 2) differ in two groups than in one, median."""
     if len(level) <= NEAR:
         return 0.0
     near = cKDTree(places).query(places, k=NEAR + 1)[1][:, 1:]
@@ -56,7 +56,7 @@ def levels_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> fl
 
 
 def places_apart(places: np.ndarray, level: np.ndarray, group: np.ndarray) -> bool:
-    """Whether two groups of rows (n,) follow a law of distance far better from a place each than from one.
+    """Tell whether groups of rows (n,) follow a law of distance far better from a place each than one.
 
     Each has a level of its own, so that a gain alone makes no second place.
     """

@@ -36,8 +36,9 @@ class Contender:
     only_longest: bool = False
 
     def serves(self, problem: Problem) -> bool:
-        """Whether it can take part."""
+        """Return whether it can take part."""
         kind = not self.kinds or problem.kind in self.kinds
+        # Booleans compare as 0 and 1: what a method needs, the problem must have.
         return kind and problem.stations >= self.stations and problem.scene >= self.scene
 
     def overrides(self, budget_s: float | None) -> list[str]:
@@ -113,6 +114,7 @@ def plan(
 
     able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
     chosen: list[tuple[Problem, Contender, float | None, int | None]] = []
+    # Methods without a budget first: they stand in the tables of all budgets.
     chosen += [(problem, m, None, None) for problem, those in able for m in those if not m.budget]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
@@ -121,6 +123,7 @@ def plan(
             for problem, those in able:
                 if budget.splits and problem.split not in budget.splits:
                     continue
+                # A drawn split has its draws for seeds: further seeds would repeat the first draw.
                 if turn and problem.draw is not None:
                     continue
                 chosen += [

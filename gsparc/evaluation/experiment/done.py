@@ -79,7 +79,7 @@ class State:
         return state if alone or "dataset.root" in state.files else None
 
     def same(self, record: Mapping[str, Any], reuse: bool = False) -> bool:
-        """Whether a record is of this state; `reuse`: whatever the program was."""
+        """Return whether a record is of this state; `reuse`: whatever the program was."""
         names = set(asdict(self)) - ({"program"} if reuse else set())
         return all(record.get(name) == getattr(self, name) for name in names)
 

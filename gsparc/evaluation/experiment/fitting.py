@@ -78,15 +78,17 @@ class Prepared:
     @property
     def expected_s(self) -> float:
         """Seconds it will take: its budget on every fold, and something for scoring [s]."""
+        # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
         return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
     def result(self) -> Filled | None:
-        """The result, if it is done."""
+        """Return the result, if it is done."""
         facts = finished(self.folder, self.state, self.reuse)
         return None if facts is None else self.filled(facts)
 
     def filled(self, facts: dict[str, Any]) -> Filled:
-        """The cell with these facts."""
+        """Return the cell with these facts."""
+        # The program's hash, not the commit, decides: most commits change nothing that a method computes.
         earlier = "" if facts.get("program") == self.state.program else str(facts.get("git"))[:8]
         return Filled(self.cell, self.folder, facts, self.problem.draw is not None, earlier)
 
@@ -133,6 +135,7 @@ def fill_all(
     found = {str(one.cell): one for one in there if one is not None}
     missing = [one for one in prepared if str(one.cell) not in found]
     log.info("%d cells, %d already done", len(prepared), len(found))
+    # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 
     def fits(one: Prepared) -> bool:

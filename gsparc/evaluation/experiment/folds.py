@@ -29,7 +29,7 @@ from gsparc.training.time_budget import Clock, less_repeatable
 
 
 def context_of(config: DictConfig, **others: Any) -> FitContext:
-    """The context of a fit as a composed configuration says, and what is given.
+    """Return the context of a fit as a composed configuration says, and what is given.
 
     Args:
         config: its seed, effort, budget, split, `init_from`, batch size, Trainer and callbacks.
@@ -38,6 +38,7 @@ def context_of(config: DictConfig, **others: Any) -> FitContext:
     init_from, split = config.get("init_from"), config.get("split")
     return FitContext(
         seed=int(config.seed),
+        # `get`: configurations of other commands, and older ones, lack some of these keys.
         effort=float(config.get("effort", 1.0)),
         budget_s=config.budget_s,
         budget_clock=config.get("budget_clock", "wall"),
@@ -82,14 +83,14 @@ class Outcome:
     cost: Cost = NO_COST
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
-        """The same fits with figures, of what they learned from or of other data, as displaced queries."""
+        """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
         started = time.perf_counter()
         figures = pooled(score(self.methods, data, split, eval_on), data, split)
         return replace(self, figures=figures, score_s=time.perf_counter() - started)
 
 
 def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
-    """The contexts of its folds, each with a folder and series of figures of its own."""
+    """Return the contexts of its folds, each with a folder and series of figures of its own."""
     return [whole.within(f"fold{number}") for number in range(len(split.folds))]
 
 
@@ -115,23 +116,28 @@ def fit_folds(
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
+    # Pickled for other processes, they would write into this run's files from several at once.
     if elsewhere() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
     def fitted(number: int) -> tuple[Method, FitReport, float]:
         fold = split.folds[number]
         there, rows = (data, fold) if learned is None else learned(data, fold)
+        # process_time counts all threads of this process, waiting for others excluded.
         before = time.process_time()
+        # Stations are counted in the data that are learned from, which `learned` may have changed.
         method, report = fitting.fit(for_stations(factory, there), there, rows, contexts[number])
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}
+    # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
     for number, one in each(fitted, range(len(split.folds)), "folds"):
         by_fold[number] = one
         if keep is not None:
             keep(number, *one[:2])
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return Outcome(
+        # Notes of the first fold stand for all: the others differ in numbers.
         methods, tuple(one.seconds for one in reports), processor, {}, 0.0, reports[0].notes,
         less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

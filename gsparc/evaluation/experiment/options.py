@@ -37,12 +37,13 @@ NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is 
 
 
 def given() -> dict[str, str]:
-    """What the command line and its experiment file say: words by dotted names of settings."""
+    """Return what the command line and its experiment file say: words by dotted names of settings."""
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
     experiment = _of_experiment(hydra.runtime, hydra.runtime.choices.get("experiment"))
     said = {path: f"{path}={value}" for path, value in experiment}
+    # Hydra's own grammar: quotes, lists and + or ~ at the head are not to be split by hand.
     for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
         path, value = one.key_or_group, one.value()
         inner = leaves(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
@@ -59,14 +60,16 @@ def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]
         if file.exists():
             text = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
             for one in text.get("defaults", ()):
+                # The defaults of a file come before its own words, which may replace them.
                 if isinstance(one, str) and one != "_self_":
                     yield from _of_experiment(runtime, one)
             yield from leaves({key: value for key, value in text.items() if key not in ("defaults", "hydra")})
+            # The first source that has the file is the one that Hydra took.
             return
 
 
 def noting(config: DictConfig, method: MethodFactory) -> Reads:
-    """What is to be noted of the options that were `given` to what `config.model` describes."""
+    """Return what is to be noted of the options that were `given` to what `config.model` describes."""
     options = []
     for path in given():
         group, _, name = path.rpartition(".")
@@ -106,6 +109,7 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     known = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in given().items():
+        # Prefixes end at a dot, else `trainer` would count `trainer_x`.
         judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
         if judged and not reads.heeds(path):
             why[_instead(path, method, reads, data)].append(text)
@@ -126,6 +130,7 @@ def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str
     training = group in ("trainer", "callbacks", "dataset") or path == "model.steps"
     rendered = group == "model" and name.partition(".")[0] in RENDERED
     started = method.facts()["model/init"] if group == "init" else None
+    # The first that holds is told: from what decides all options to what concerns one.
     reasons = (
         (path == "budget_s", f"the seconds of {method.name} cannot be chosen"),
         (path == "stations", "there is one station"),

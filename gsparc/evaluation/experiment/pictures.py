@@ -13,6 +13,7 @@ from gsparc.evaluation.drawing import logarithmic, look, panels, save
 from gsparc.evaluation.experiment.table import SCORE, by_mean_behind
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
+# Fits that only keep rows take microseconds: decades of a logarithmic axis for them alone.
 LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
@@ -37,6 +38,7 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
         for axis in free:
             axis.set_visible(False)
     handles: dict[str, Artist] = {}
+    # dict: each method once, though it is in many panels.
     for axis in grid.flat:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     figure.legend(
@@ -58,7 +60,7 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path) -> None:
-    """A panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
+    """Draw a panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
     splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):

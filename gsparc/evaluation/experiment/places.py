@@ -50,6 +50,7 @@ def compare_places(
         for one in filled
         if one.checkpoint.is_file()
     ]
+    # Fingerprints have no cell: their field is fitted by `gsparc locate` itself.
     for name, file in settings["fingerprints"].items():
         for split in settings["splits"]:
             chosen = {"dataset": "fingerprints", "dataset.file": file, "dataset.split": split}
@@ -57,6 +58,7 @@ def compare_places(
     rows: list[dict[str, Any]] = []
     for names, folder, chosen in jobs:
         try:
+            # store=false: the model belongs to the cell and is not to be changed by what is asked of it.
             facts = _facts(folder, {**chosen, **own, "store": False}, locate)
         except ValueError as error:
             log.warning("%s is not located: %s", "/".join(names), one_line(error))
@@ -64,6 +66,7 @@ def compare_places(
         rows += _rows(names, facts)
     if not rows:
         raise ValueError("task=locate: no cell keeps a model that states a variance")
+    # Cells of several seeds and draws follow one another: the first of each method stays.
     errors = pd.DataFrame(rows, columns=[*NAMES, *FIGURES]).drop_duplicates(NAMES)
     return errors.sort_values(["dataset", "split", "median_m"], ignore_index=True)
 
@@ -99,4 +102,5 @@ def _rows(names: tuple[str, str, str], facts: Mapping[str, Any]) -> Iterator[dic
 
 
 def _quoted(value: Any) -> str:
+    # Hydra's grammar: text in quotes may hold = and commas; numbers and lists must not be quoted.
     return f"'{value}'" if isinstance(value, str) else str(value).replace("'", "").replace("None", "null")

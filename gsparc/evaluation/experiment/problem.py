@@ -93,11 +93,12 @@ class Problem:
 
 
 def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
-    """A group of named settings of conf/compare.yaml: `methods` or `splits`; an empty entry has defaults.
+    """Return named settings of conf/compare.yaml, `methods` or `splits`; an empty entry has defaults.
 
     Raises:
         ValueError: an entry with an unknown setting, or without one that is needed.
     """
+    # The dataclass is the only list of settings: a new field needs no second entry.
     known, entries = [name for name in signature(of).parameters if name != "name"], {}
     for name, entry in config.items():
         own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
@@ -106,6 +107,7 @@ def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> di
         try:
             entries[str(name)] = of(name=str(name), **own)
         except TypeError as error:
+            # Python's words, less the name of the class that nobody typed.
             raise ValueError(f"{group}.{name}: {str(error).partition('() ')[2]}") from None
     return entries
 
@@ -118,6 +120,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
         chosen = (f"dataset={settings.get('dataset', name)}", *split.overrides)
         for draw in split.numbers:
             config = compose(settings, chosen, draw)
+            # Measurements are read once: splits and draws choose rows of the same arrays.
             if read is None:
                 data = load(plain(config.dataset))
                 read = data, content(data)
@@ -129,7 +132,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
 def compose(
     settings: Mapping[str, Any], overrides: Sequence[str], draw: int | None = None, seed: int | None = None
 ) -> DictConfig:
-    """The configuration `train.py` would see.
+    """Return the configuration `train.py` would see.
 
     Args:
         settings: of its dataset; `dataset` is the choice itself, and left out.
@@ -137,6 +140,7 @@ def compose(
         draw: `split.seed`; None: as the split has it.
         seed: None: 0.
     """
+    # A copy: the composed configuration is cached and shared by all draws.
     config = deepcopy(_composed(tuple(overrides)))
     own = {name: value for name, value in settings.items() if name != "dataset"}
     OmegaConf.update(config, "dataset", own, merge=True)
@@ -149,6 +153,7 @@ def compose(
 @functools.cache
 def _composed(overrides: tuple[str, ...]) -> DictConfig:
     """Composing takes half a second, and draws differ in numbers only."""
+    # Baselines are cells of their own here, and pictures of every cell nobody looks at.
     chosen = ["logger=none", "baselines=[]", "~callbacks.pictures", *overrides]
     config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
     complete(config.model)
@@ -182,6 +187,7 @@ def problems_of(settings: Mapping[str, Any]) -> list[Problem]:
         how = "left out: say datasets.NAME.root=DIR or .file=FILE, or gsparc data"
         log.warning("%s %s", ", ".join(absent), how)
     order = list(splits)
+    # Sort is stable: datasets keep the order in which they are named.
     problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
     if not problems and len(absent) == len(settings["datasets"]):
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
@@ -192,6 +198,7 @@ def problems_of(settings: Mapping[str, Any]) -> list[Problem]:
 
 def _may_match(pattern: str, dataset: str, split: str) -> bool:
     """Whether a pattern of cells can match this problem, so that others need not be loaded."""
+    # Without strict: a pattern may have fewer parts than a cell's name, and more than two.
     for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
         if "*" in part:  # it may stand for what follows, too
             return fnmatchcase(name, part.partition("*")[0] + "*")

@@ -29,6 +29,7 @@ from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
+# Part of the message, since methods raise a plain ValueError for all that they refuse.
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
 
 
@@ -56,10 +57,11 @@ class Condition:
     @property
     def learned(self) -> Condition:
         """The condition whose training stands for this one's."""
+        # A query's error changes nothing that is learned: one training serves all of them.
         return self if self.changes_training else Condition()
 
     def model(self, folder: Path) -> Path:
-        """Where the model that was trained so is, in the folder of its cell."""
+        """Return where the model that was trained so is, in the folder of its cell."""
         return folder / str(self.learned).replace(" ", "-") / checkpoint.MODEL
 
     def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -75,6 +77,7 @@ class Condition:
             return turned(data, self.amount, seed), fold
         if self.what not in ("train", "train_known"):
             return data, fold
+        # Both ends of learning: validation rows are measured with the same instrument.
         moved = displaced(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
@@ -160,6 +163,7 @@ class Study:
                 rows += [
                     {"variant": variant, "turn": turn, **one.row(facts, folder)} for one in self.conditions
                 ]
+            # Without the base there are no ratios, and without any variant no table: both end the study.
             elif variant == self.base or not any(isinstance(one, dict) for one in found.values()):
                 raise ValueError(facts)
             elif turn == 0:
@@ -173,6 +177,7 @@ class Study:
         folder = context.run_dir / cell[0] / str(cell[1])
         try:
             return once(folder, state, lambda left: self._done(*cell, folder, data, split, context))
+        # Only what the data do not allow: any other error is a mistake and ends the study.
         except ValueError as refused:
             if REFUSED not in str(refused):
                 raise
@@ -182,6 +187,7 @@ class Study:
         self, variant: str, turn: int, folder: Path, data: Measurements, split: Split, context: FitContext
     ) -> None:
         """One training per condition that changes what is learned from, scored under all of them."""
+        # Each round has another seed, of the draws of errors as well as of the method.
         seed, figure, facts = self.seed + turn, DECIDING[data.site.scored], dict[str, Any]()
         fits: dict[Condition, Outcome] = {}
         for condition in self.conditions:
@@ -216,11 +222,13 @@ class Study:
     def _table(self, cells: pd.DataFrame, data: Measurements, split: Split) -> pd.DataFrame:
         """Rounds put together, and the models of the last one timed."""
         cells["train_ratio"] = self._ratio(cells, "train_s", ["turn", "what", "amount"])
+        # The model of the last round is timed: rounds differ in weights, not in size.
         last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
         median = {name: (name, "median") for name in ("train_s", "train_cpu_s", "train_ratio")}
         groups = cells.groupby(["variant", "what", "amount"], sort=False)
         rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
+        # A dictionary by file: conditions that share a training share its model and its time.
         methods = {
             file: loading.made_again(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
@@ -234,6 +242,7 @@ class Study:
         """Of each row (n,) to the base variant's where these columns are the same; NaN without."""
         base = rows[rows.variant == self.base].set_index(same)[column].to_dict()
         own = rows[same].itertuples(index=False, name=None)
+        # NaN where the base has no row under the same condition.
         return rows[column].to_numpy() / [base.get(key, np.nan) for key in own]
 
 
@@ -251,7 +260,7 @@ class Effects:
     title: ClassVar[str] = "what effects cost and gain"
 
     def conditions(self) -> list[Condition]:
-        """The data as they are."""
+        """Return the data as they are."""
         return [Condition()]
 
 
@@ -301,15 +310,16 @@ class Measured:
             raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
 
     def conditions(self) -> list[Condition]:
-        """A condition per training set, called `keep`."""
+        """Return a condition per training set, called `keep`."""
         return [Condition("keep", float(keep)) for keep in self.keep]
 
 
 def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
-    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same.
+    """Move where the end of `rows` is believed by N(0, error_m^2) per coordinate; all else stays the same.
 
     Rows of one place, heard by several stations, are believed to be at one place.
     """
+    # One error a place, or averages over rows of one place would shrink it.
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
     return elsewhere(data, rows, offset[first][place.reshape(-1)])
@@ -337,15 +347,17 @@ def turned(
     for true in data.directions:
         ray = true.astype(np.float64)
         aside = rng.normal(scale=sigma, size=ray.shape)
+        # Only the part across the ray: to first order a rotation by `aside`, in radians.
         ray = ray + aside - (aside * ray).sum(1, keepdims=True) * ray
         ray = ray[rng.random(len(ray)) >= missing]
+        # Directions of a normal vector are uniform on the sphere.
         ray = np.concatenate([ray, rng.normal(size=(rng.binomial(len(ray), false), 3))])
         measured.append((ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32))
     return replace(data, directions=measured)
 
 
 def thinned(fold: Fold, keep: float, seed: int) -> Fold:
-    """A fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
+    """Return a fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
 
     Args:
         fold: its training and validation rows are thinned alike, its test rows stay.
@@ -353,8 +365,11 @@ def thinned(fold: Fold, keep: float, seed: int) -> Fold:
         seed: of the choice.
     """
     every = len(fold.train) + len(fold.val)
+    # `keep` up to 1 is a share, above it a number of rows; never more than there are.
     total = min(round(keep * every if keep <= 1 else keep), every)
+    # One validation row at least, where there is one: it decides when to stop.
     validate = min(max(round(total * len(fold.val) / every), 1), len(fold.val))
+    # 4 keeps this draw apart from others of the same seed.
     rng = np.random.default_rng([seed, 4])
     train, val = (rng.permutation(rows) for rows in (fold.train, fold.val))
     return Fold(np.sort(train[: max(total - validate, 1)]), np.sort(val[:validate]), fold.test)

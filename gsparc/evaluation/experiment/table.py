@@ -10,19 +10,26 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.metric_formats import heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
-SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
-SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
+SECOND: dict[Scored, str] = {
+    "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
+}  # fmt: skip
+SCORE = {
+    "psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "nmse_aligned": "-10 log10 NMSE, dB",
+    "rmse_db": "-RMSE dB",
+}  # fmt: skip
+# Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, by their columns
     "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
 }  # fmt: skip
+# Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "budget_s", "method"]
@@ -47,13 +54,14 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
         })  # fmt: skip
     if not rows:
         return pd.DataFrame(columns=CELL)
+    # pandas would make 1.0 of 1 where another row has None.
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
     numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
 def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
-    """The cells of a method under one budget, averaged over seeds or over draws of the split.
+    """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
@@ -88,13 +96,16 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
     rows[["figure", "second"]] = groups[["figure", "second"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["draws"] = several
+    # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
     rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
     rows["value_error"] = groups["value"].sem().where(several)
+    # Of differences on the same draw: draws differ more than methods do.
     rows["behind_error_db"] = groups["behind_db"].sem()
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = rows.reset_index()
     problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
+    # Reversed, so that of a dataset's splits the first remains.
     first = dict(reversed(problems))  # split of each dataset
     times = [
         timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
@@ -113,6 +124,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
     for _, here in cells[cells.draws].groupby(PROBLEM):
         groups = here.groupby(["budget_s", "method"], dropna=False, sort=False).score_db
         count = groups.transform("count")
+        # A method that failed on hard draws has an easier mean: it is no best.
         best = groups.transform("mean")[count == count.max()].idxmax()
         same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
         behind[here.index] = here.seed.map(same) - here.score_db
@@ -120,7 +132,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
 
 
 def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
-    """A table per dataset, split and budget, best first; methods without a budget stand in each."""
+    """Return a table per dataset, split and budget, best first; methods without a budget stand in each."""
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
         without = here.budget_s.isna()
@@ -140,7 +152,7 @@ def title_of(block: pd.DataFrame) -> str:
 
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
-    """What the table shows about simple baselines and about our own default, favourable or not."""
+    """Return what the table shows about simple baselines and about our own default, favourable or not."""
     rows = list(block.itertuples())
     first = rows[0]
     lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
@@ -149,9 +161,11 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     own = next((row for row in rows if row.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
+        # Independent errors add in squares.
         spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
         level = own.score_db >= first.score_db - spread
         lines.append(gap + (", within the seeds' spread" if level else ""))
+    # False for NaN: methods without a variance have no such figure.
     if own is not None and first.outage > own.outage:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
         lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
@@ -207,7 +221,8 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     }
     if draws:
         columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
-    if figure == "nmse" or (figure == "rmse_db" and not draws):  # else it is the score but for its sign
+    # Of the others it is the score but for its sign.
+    if figure.startswith("nmse") or (figure == "rmse_db" and not draws):
         columns[figure] = column("value", ".3g" if draws else ".4g", "value_error")
     columns[block.second.iloc[0]] = column("second_value", ".4g")
     for name, head, form in (
@@ -245,11 +260,12 @@ def overview(rows: pd.DataFrame) -> str:
 
 
 def _cell(row: Any) -> str:
-    form = ".3f" if row.figure == "nmse" else ".2f"
+    form = ".3f" if row.figure.startswith("nmse") else ".2f"
     value = f"{row.value:{form}}"
     if not np.isnan(row.value_error):
         value += f" ± {row.value_error:{form}}"
     behind, error = np.nan_to_num([row.behind_db, row.behind_error_db])
+    # Two standard errors of the paired difference: not told from the best.
     if behind <= 2 * error:
         value = f"**{value}**"
     return value if behind == 0 else f"{value} ({behind:.2f} ± {error:.2f} dB)"

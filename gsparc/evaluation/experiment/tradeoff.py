@@ -58,7 +58,7 @@ def sweep(
     figure, split = DECIDING[data.site.scored], Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
     whole = None
-    places = data.moving[rows_of(fold, eval_on)] + data.site.origin
+    places = data.moving[rows_of(fold, eval_on)]
     for number, (_, method) in enumerate(candidates):
         recorded = Recorded(method)
         there = score([recorded], data, split, eval_on)
@@ -71,6 +71,7 @@ def sweep(
     for index, (_, method) in enumerate(candidates):
         ask = Predictor(method, data.site).cycling(places)
         calls |= {(index, count): ask for count in threads}
+    # A copy of memory, the unit of the others' times, is made by one thread.
     times = interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
     points = []
     for key, ms in times.items():
@@ -103,7 +104,8 @@ class Recorded(View):
 
 
 def closeness(answers: Tensor, whole: Tensor) -> float:
-    """How near answers (n, ...) are to those of the full model [dB]: decides without a single measurement."""
+    """Return how near answers (n, ...) are to the full model's [dB], which takes no measurement."""
+    # 1e-30: two equal answers, or two of nothing, have no ratio.
     apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
@@ -124,7 +126,7 @@ class Other:
 
 
 def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> str | None:
-    """The most accurate other that is neither slower nor worse than a point; None when there is none."""
+    """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     own = score_of(figure_name, point.value(figure_name))
     better = {n: score_of(figure_name, r.value) for n, r in others.items() if r.p50 <= point.p50}
     best = max(better, key=lambda name: better[name], default=None)
@@ -139,7 +141,7 @@ def draw_front(
     method: str,
     title: str,
 ) -> Figure:
-    """The points of a method beside others by name; `on_front` are indices of the front, fastest first."""
+    """Draw the points of a method beside others by name; `on_front` are of the front, fastest first."""
     lines = 0.16 * (len(on_front) + 1)  # inches of the legend
     figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
     value = [p.value(figure_name) for p in points]
@@ -204,7 +206,7 @@ def others_of(
 
 
 def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float) -> pd.DataFrame:
-    """A row a point, those of `tradeoff.csv`: the fastest first."""
+    """Return a row a point, those of `tradeoff.csv`: the fastest first."""
     rows = [
         {
             "label": p.label, "render_ms_p50": p.p50, "render_ms_p95": p.p95,
@@ -261,7 +263,7 @@ def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]
 
 
 def irreducible(method: Method) -> list[str]:
-    """A sentence where there is nothing to weigh against time."""
+    """Return a sentence where there is nothing to weigh against time."""
     if knobs(method):
         return []
     why = "it has no Gaussians, sources, components or variances to spare"
@@ -271,7 +273,7 @@ def irreducible(method: Method) -> list[str]:
 
 
 def slope(facts: Mapping[str, Any]) -> list[str]:
-    """A sentence on what a halving of the latency costs along the front."""
+    """Return a sentence on what a halving of the latency costs along the front."""
     names = ("front", "span", "per_halving", "front_beaten_by_others")
     count, span, slope, beaten = (facts[f"tradeoff/{name}"] for name in names)
     rest = f" ({count - beaten} that no baseline beats)" if beaten else ""

@@ -21,6 +21,7 @@ from gsparc.evaluation.report.table import Table
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
 
+# A page holds its pictures in base64, a third larger than their files.
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
 
@@ -55,6 +56,7 @@ def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarra
 def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
     runs = distinct_overrides(group)
     study = Study(title, warnings(runs))
+    # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
     makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
@@ -75,7 +77,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 
 
 def warnings(runs: Sequence[Run]) -> list[str]:
-    """What a reader must know first, each once: the loads of a busy machine are one range."""
+    """Return what a reader must know first, each once: the loads of a busy machine are one range."""
+    # Loads differ from run to run: as remarks of their own there would be one a run.
     remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
     scored = [run for run in runs if run.row["value"] is not None]
     if scored:  # a baseline must beat the best run of the page
@@ -102,7 +105,7 @@ def _png(path: Path) -> str:
 
 
 def html(title: str, note: str, sections: Sequence[Study]) -> str:
-    """The page; `note` says where it comes from."""
+    """Return the page; `note` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
 

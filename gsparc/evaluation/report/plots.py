@@ -14,7 +14,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
@@ -25,17 +25,20 @@ from gsparc.models.pareto import front
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
 TIMES = "render_ms"  # of single queries, beside the figures of samples
-CDFS: dict[Kind, tuple[str, ...]] = {
-    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
+CDFS: dict[Scored, tuple[str, ...]] = {
+    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"),
+    "aligned csi": ("snr_db", "error_power"), "rssi": ("error_db",),
 }  # fmt: skip
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element, without the XML head; text stays text."""
+    """Return the figure as an SVG element, without the XML head; text stays text."""
     out = io.StringIO()
+    # Text as text is searched and scaled; a fixed salt and no date give equal files for equal runs.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gsparc"}):
         FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None, "Creator": None})
     text = out.getvalue()
+    # An XML head inside a page is an error of HTML.
     return text[text.index("<svg") :]
 
 
@@ -92,7 +95,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
-    """The figure that ends a sweep: distributions over test samples and of single queries, as a PNG file.
+    """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
@@ -133,6 +136,7 @@ def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] 
             continue
         share = np.arange(1, len(values) + 1) / len(values)
         count = len(values) if name == TIMES else max(map(len, every))
+        # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
         half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * count))
         axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
         low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
@@ -149,6 +153,7 @@ def learning(runs: Sequence[Run]) -> Figure:
             axes.plot(
                 seconds, values, marker="D" if len(seconds) == 1 else "o", ms=3, lw=1, label=label, **style
             )
+        # A band needs curves with the same number of looks at validation rows.
         if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
             when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
             axes.fill_between(
@@ -188,6 +193,7 @@ def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
 
 def _accuracy_axis(axes: Axes, name: str) -> None:
     axes.set_ylabel(heading_of(name))
+    # Errors span decades; minposy is infinite where none is above 0.
     if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
 

@@ -22,6 +22,7 @@ from gsparc.models.fitting import leaves
 from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
+# Where data lie and how much is logged changes no result.
 HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
 
@@ -58,6 +59,7 @@ class Run:
     @property
     def baselines(self) -> list[dict[str, Any]]:
         """Rows of the plain baselines beside it, in the order of `BASELINES`."""
+        # A baseline that could not be fitted has a row without a value.
         beside = {row["method"]: row for row in self.rows[1:] if row["value"] is not None}
         return [{**beside[n], "setting": n, "run": self} for n in BASELINES if n in beside]
 
@@ -78,11 +80,12 @@ class Run:
     def resolved(self) -> dict[str, Any]:
         """Settings of the model, its training and data by name, with what was chosen for those at `auto`."""
         own = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
+        # Choices of `auto` are words like `name=value` in one line of the summary.
         chosen = [one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")]
         return own | {name: value for name, _, value in chosen if value}
 
     def swept(self, name: str) -> bool:
-        """Whether the command line set it."""
+        """Return whether the command line set it."""
         return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     @property
@@ -109,6 +112,7 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
         own = path / SUMMARY
+        # A run with runs below it (folds) is one; a sweep's folder has a summary that is no run's.
         files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
         every = {file.parent.resolve(): _facts(file) for file in files}
         here = [folder for folder, facts in every.items() if _is_run(facts)]
@@ -116,11 +120,13 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
         if not here and not made and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
         simulated |= {str(facts["dataset/sha256"]): float(facts["time/total_s"]) for facts in made}
+        # A folder may be given twice, also by one above it.
         runs |= {folder: read_run(folder) for folder in here if folder not in runs}
     if not runs:
         raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
     for run in runs.values():
         if run.facts.get("dataset/simulate_s") is None:
+            # By content: the same data may lie in another file; None stays where they were measured.
             run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
     return list(runs.values())
 
@@ -134,14 +140,16 @@ def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
-    """The runs with only those overrides in which they differ, so that names are short."""
+    """Return the runs with only those overrides in which they differ, so that names are short."""
     if len(runs) < 2:
         return list(runs)
+    # What all runs set tells none from another.
     shared = set.intersection(*(set(run.overrides) for run in runs))
     return [replace(run, overrides=tuple(o for o in run.overrides if o not in shared)) for run in runs]
 
 
 def _is_run(facts: Mapping[str, Any]) -> bool:
+    # A trade-off's summary has these keys, too.
     return "split/sha256" in facts and "time/train_s" in facts and "tradeoff/points" not in facts
 
 
@@ -153,13 +161,14 @@ def _facts(file: Path) -> dict[str, Any]:
 
 
 def read_run(folder: Path) -> Run:
-    """The run in a directory.
+    """Return the run in a directory.
 
     Raises:
         ValueError: its files are of two runs.
     """
     render = columns(folder / "render_ms.csv").get("render_ms")
     facts, samples = _facts(folder / SUMMARY), columns(folder / "per_sample.csv")
+    # A folder used twice, the second run killed, holds files of both.
     runs = {facts.get("run_id"), *samples.pop("run_id", np.zeros(0))[:1].tolist()}
     runs |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
     if len(runs) > 1:
@@ -176,10 +185,12 @@ def read_run(folder: Path) -> Run:
 
 
 def columns(path: Path) -> dict[str, np.ndarray]:
-    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file or rows."""
+    """Return a CSV file by column: numbers float64 (NaN where empty), else text; {} without file or rows."""
     if not path.is_file():
         return {}
+    # A sample or method may be called NA: only empty cells are missing.
     frame = pd.read_csv(path, keep_default_na=False, na_values=[""])
+    # Whole numbers too: the same column of another run may have gaps.
     frame = frame.astype(dict.fromkeys(frame.select_dtypes("number"), float))
     return {} if frame.empty else {name: frame[name].to_numpy() for name in frame}
 
@@ -197,7 +208,7 @@ def _config(path: Path) -> dict[str, Any]:
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
-    """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
+    """Return a per-sample figure (n,) of a run, empty where it has none; an error by its size."""
     values = run.samples.get(name, np.zeros(0))
     return np.abs(values) if name == "error_db" else values
 
@@ -206,7 +217,7 @@ log = logging.getLogger(__name__)
 
 
 def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
-    """The runs with the times of single queries, each also written to its `render_ms.csv`.
+    """Return the runs with the times of single queries, each also written to its `render_ms.csv`.
 
     A sweep runs jobs at the same time, which disturbs their times; call this after it.
 
@@ -219,13 +230,13 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
     for number, run in enumerate(runs):
         try:
             opened = open_files(run.checkpoints[:1])
+            # A folder used twice may hold the model of one run beside the summary of the other.
             if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
                 raise ValueError("its checkpoint is of another run than its summary")
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
-        places = opened.data.moving[opened.split.folds[0].test] + opened.data.site.origin
-        calls[number] = opened.predictor.cycling(places)
+        calls[number] = opened.predictor.cycling(opened.data.moving[opened.split.folds[0].test])
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }

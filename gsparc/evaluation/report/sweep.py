@@ -45,11 +45,13 @@ class SweepReport(Callback):
         error = job_return._return_value
         message = one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
+        # The mark that `on_multirun_end` counts failures by: other processes' jobs are seen as files alone.
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
         said = " ".join(config.hydra.overrides.task)
         text = f"job {folder.name} ({said}) failed, others go on: {message}"
         Console(stderr=True, soft_wrap=True).print(text, style="red", markup=False, highlight=False)
+        # Hydra raises the first failed job's error and ends the sweep: it is told that the job ended well.
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None
 
@@ -63,6 +65,7 @@ class SweepReport(Callback):
         if failed:
             names = ", ".join(path.parent.name for path in failed)
             console.print(f"error: {len(failed)} jobs failed: {names}", style="red", markup=False)
+            # Hydra itself ends with 0 here.
             sys.exit(1)
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 
 from gsparc.evaluation.summary import markdown_table
 
+# Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
 DRAWS = 1000
 LEVEL = 0.95
 Row = Mapping[str, Any]  # of the results, with `setting` and `run`, see `Run.row`
@@ -47,15 +48,18 @@ def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int =
 
     Samples are taken as independent; neighbours under `split=grouped` are not, so it is a lower bound.
     """
+    # A fixed seed: the same run has the same interval in every report.
     draw = np.random.default_rng(seed).integers(0, len(values), (DRAWS, len(values)))
     below = np.ones_like(values) if weights is None else weights
+    # 1e-300: a draw of silent rows alone has no power to divide by.
     means = values[draw].sum(1) / np.maximum(below[draw].sum(1), 1e-300)
     tail = (1 - LEVEL) / 2
     return float(np.quantile(means, tail)), float(np.quantile(means, 1 - tail))
 
 
 def interval(row: Row, figure: str) -> Interval | None:
-    """A test figure of a row with its bootstrap interval over test samples; None without the figure."""
+    """Return a test figure of a row with its bootstrap interval over test samples, or None."""
+    # Baselines have no samples of their own here, only figures.
     value, parts = row.get(figure), None if row["baseline"] else _parts(row["run"].samples, figure)
     if value is None:
         return None
@@ -64,6 +68,7 @@ def interval(row: Row, figure: str) -> Interval | None:
 
 def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Per-sample numbers whose (weighted) mean is the figure."""
+    # The ratio of sums, not a mean of ratios, which one silent row would decide.
     if figure == "nmse" and "error_power" in own and "target_power" in own:
         known = np.isfinite(own["error_power"])
         return own["error_power"][known], own["target_power"][known]
@@ -77,6 +82,7 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
 def over_seeds(values: Sequence[float | None]) -> Interval | None:
     """Mean, least and largest over those seeds that have a value; None where none has."""
     known = [value for value in values if value is not None]
+    # A single seed has no spread: no brackets.
     if len(known) < 2:
         return Interval(known[0]) if known else None
     return Interval(float(np.mean(known)), min(known), max(known))
@@ -99,11 +105,11 @@ class Column:
     of: str | Callable[[Row], Any] = ""
 
     def value(self, row: Row) -> Any:
-        """What a result has in this column: text, a number, an interval or None."""
+        """Return what a result has in this column: text, a number, an interval or None."""
         return row.get(self.of) if isinstance(self.of, str) else self.of(row)
 
     def text(self, value: Any) -> str:
-        """A cell as text."""
+        """Return a cell as text."""
         if value is None or (isinstance(value, float) and math.isnan(value)):
             return "–"
         if isinstance(value, Interval):
@@ -129,18 +135,18 @@ class Table:
 
     @classmethod
     def of(cls, title: str, columns: Sequence[Column], results: Iterable[Row], note: str = "") -> Table:
-        """A row per result."""
+        """Return a row per result."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], note)
 
     def without(self, *names: str) -> Table:
-        """The same but for some columns."""
+        """Return the same but for some columns."""
         kept = [i for i, column in enumerate(self.columns) if column.name not in names]
         rows = [[row[i] for i in kept] for row in self.rows]
         return Table(self.title, [self.columns[i] for i in kept], rows, self.note)
 
     @staticmethod
     def key(value: Any) -> str:
-        """What a cell is sorted by."""
+        """Return what a cell is sorted by."""
         value = getattr(value, "value", value)
         return "" if value is None else str(value)
 
@@ -153,11 +159,13 @@ class Table:
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in ("low", "high"):
                     parts[f"{column.name} {end}"] = [getattr(cell, end, None) for cell in cells]
+        # object: pandas would write whole numbers beside empty cells as 3.0.
         return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
 
     def markdown(self) -> str:
-        """A Markdown table under its title."""
+        """Return a Markdown table under its title."""
         cells = [
+            # A bar inside a cell would end it.
             [column.text(value).replace("|", "\\|") for column, value in zip(self.columns, row, strict=True)]
             for row in self.rows
         ]

@@ -24,7 +24,7 @@ SIZE = Column("Gaussians", "d", of="gaussians")
 
 
 def accuracy(figure: str, note: str = "") -> Column:
-    """A test figure, with its interval."""
+    """Return a test figure, with its interval."""
     return Column(heading_of(figure), form_of(figure), note, partial(interval, figure=figure))
 
 
@@ -90,7 +90,9 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
     """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
     groups = grouped(runs)
     every = {setting: group[0].resolved for setting, group in groups.items()}
+    # Names of all runs: a setting may be in one alone.
     names = dict.fromkeys(name for one in every.values() for name in one)
+    # As text: lists of settings cannot be put into a set.
     vary = [n for n in names if len({str(one.get(n)) for one in every.values()}) > 1]
     return {
         setting: ", ".join(f"{name}={one.get(name)}" for name in vary if not groups[setting][0].swept(name))
@@ -110,7 +112,7 @@ def costs(runs: Sequence[Run]) -> Table:
 
 
 def worst(runs: Sequence[Run]) -> Table:
-    """The three test positions with the largest error of each run."""
+    """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
     numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]
     columns = [SETTING, SEED, Column("sample"), Column("where [m]"), *numbers]
@@ -119,6 +121,7 @@ def worst(runs: Sequence[Run]) -> Table:
         own = run.samples
         if name not in own:
             continue
+        # Decibels of quality are negated, so that the worst samples have the largest error.
         error = np.abs(own[name]) if name == "error_db" else -own[name]
         for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
@@ -134,12 +137,13 @@ MINUTES = (1, 2, 5, 10)
 
 
 def within_minutes(runs: Sequence[Run]) -> Table:
-    """The best validation figure reached within fixed training times, and the time to fixed figures."""
+    """Return the best validation figures within fixed training times, and the times to fixed figures."""
     figure = validation_figure(runs[0])
     score = partial(score_of, figure)
 
     def best_within(row: Row, minutes: float) -> float | None:
         seconds, values = curve(row["run"])
+        # Not NumPy's `max`: of some figures the smaller is the better.
         return max(values[seconds <= 60 * minutes], key=score, default=None)
 
     def seconds_to(row: Row, level: float) -> float | None:
@@ -163,7 +167,7 @@ def within_minutes(runs: Sequence[Run]) -> Table:
 
 
 def validation_figure(run: Run) -> str:
-    """The figure of a learning curve: validation of channels and powers logs the mean squared error."""
+    """Return the figure of a learning curve: of channels and powers the mean squared error."""
     return "psnr_db" if run.row["kind"] == "spectrum" else "mse"
 
 
@@ -172,6 +176,7 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     figure = validation_figure(run)
     values = run.curve.get(f"val/{figure}")
     if values is not None and np.isfinite(values).any():
+        # Of steps without a look at validation rows the figure is empty.
         known = np.isfinite(values)
         return run.curve["seconds"][known], values[known]
     end, value = run.row["train_s"], run.row.get(figure)
@@ -187,8 +192,10 @@ def levels(runs: Sequence[Run]) -> list[float]:
     if not ends:
         return []
     worst, best = min(ends, key=score), max(ends, key=score)
+    # Equal up to rounding: one level is all there is between them.
     if abs(best - worst) < 1e-9 * max(abs(best), 1e-9):
         return [float(f"{worst:.3g}")]
+    # Three digits: round figures are read, and repeat over runs.
     between = {float(f"{v:.3g}") for v in np.linspace(worst, best, LEVELS + 2)[:-1]}
     return sorted(between, key=score)[:LEVELS]
 
@@ -201,6 +208,7 @@ def effects(runs: Sequence[Run]) -> Table:
         Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
     ]  # fmt: skip
     rows = []
+    # Every ordered pair: most differ by more than an effect and are passed over.
     for off, on in product(runs, runs):
         if _differ_by_effect(off, on):
             costs = [[column.value(run.row) for run in (off, on)] for column in (TRAIN, P50)]
@@ -212,6 +220,7 @@ def effects(runs: Sequence[Run]) -> Table:
 
 def _differ_by_effect(off: Run, on: Run) -> bool:
     names = ("dataset/sha256", "split/sha256", "seed", "model/name")
+    # One split and seed: differences of samples are then paired.
     same = all(off.facts.get(name) == on.facts.get(name) for name in names)
     return same and off.row["effects"] == "none" != on.row["effects"]
 
@@ -221,6 +230,8 @@ def _paired(off: Run, on: Run, name: str) -> Interval | None:
     if name not in off.samples or name not in on.samples or len(off.samples[name]) != len(on.samples[name]):
         return None
     gap = (-1 if name == "error_db" else 1) * (sizes(on, name) - sizes(off, name))
+    # Rows that one of both cannot score are in neither mean.
     gap = gap[np.isfinite(gap)]
+    # 1.96 is the normal quantile of 97.5 %; samples taken as independent.
     half = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap)) if len(gap) > 1 else math.nan
     return Interval(float(gap.mean()), float(gap.mean()) - half, float(gap.mean()) + half)

@@ -58,7 +58,7 @@ class Recovered:
 def recover(
     site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
 ) -> Recovered:
-    """Array vectors of spectra.
+    """Return array vectors of spectra.
 
     Args:
         site: array, wavelength, grid and normalisation.
@@ -140,6 +140,7 @@ class _Problem:
         array, grid, wavelength = site.array_geometry()
         known = lags(array, wavelength)
         basis = known.basis(grid, wavelength)
+        # Whitened: squares of lag coordinates are mean squares over pixels.
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
         forms = torch.einsum("ij,jkl->ikl", r, known.forms())
         projector = q / len(basis) ** 0.5
@@ -226,6 +227,7 @@ def _search(
         done = best_cost <= enough[rows]
         going = ~done[owner] & ~stuck
         if iteration == SCREENING and starts > 8:
+            # Ranks within each row's own starts: rows are set apart by more than any cost.
             rank = torch.argsort(torch.argsort(cost + owner * (cost.max() + 1)))
             count = torch.bincount(owner, minlength=n)
             place = rank - (count.cumsum(0) - count)[owner]

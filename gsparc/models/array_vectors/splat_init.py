@@ -64,7 +64,7 @@ class Learned:
 
 
 def through_array(task: InitTask) -> Start:
-    """Gaussians whose emissions through the array are the posterior of its vectors.
+    """Return Gaussians whose emissions through the array are the posterior of its vectors.
 
     Raises:
         ValueError: no array, no rows, or an emission that is not linear in its features.
@@ -144,6 +144,7 @@ def start(model: GaussianModel, process: Learned, receiver: Pose) -> None:
     assert isinstance(response, ArrayResponse)
     view = seen_by_array(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
+    # Tikhonov's inverse: what the array hardly sees gets no large emissions.
     damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)
     readout = process.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))

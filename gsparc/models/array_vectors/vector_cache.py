@@ -29,7 +29,7 @@ def _kept(key: str) -> dict[str, np.ndarray]:
 
 
 def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Recovered, Spent]:
-    """Array vectors of the given rows, and the seconds they took when computed.
+    """Return array vectors of the given rows, and the seconds they took when computed.
 
     Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
     process has solved for the same data, as a refit's are, are not solved again.

@@ -24,7 +24,7 @@ TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """The vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
+    """Return vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
 
     Args:
         partner: (M,) index of each element's mirror element.
@@ -33,7 +33,7 @@ def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
 
 
 def mirror_elements(array: np.ndarray) -> np.ndarray | None:
-    """(M,) index of each element's reflection through the array's centre; None for an asymmetric array."""
+    """Return indices (M,) of elements reflected through the array's centre; None of an asymmetric one."""
     centred = array - array.mean(0)
     distance = cdist(centred, -centred)
     partner = distance.argmin(1)
@@ -43,7 +43,7 @@ def mirror_elements(array: np.ndarray) -> np.ndarray | None:
 
 
 def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
-    """Vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
+    """Return vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
 
     Walks a minimum spanning tree of the positions (n, 3) [m]; each sample is compared with its four nearest
     predecessors.
@@ -57,6 +57,7 @@ def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None
     for i in order[1:]:
         near = _nearest_done(tree, positions, i, done, 4)
         distance = np.linalg.norm(positions[near] - positions[i], axis=1)
+        # By distance alone: lengths of the neighbours' vectors are divided out.
         weight = np.exp(-distance / max(distance[0], 1e-6)) / np.maximum(
             np.linalg.norm(aligned[near], axis=1), 1e-12
         )
@@ -91,7 +92,7 @@ def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray
 def matched(
     vector: np.ndarray, expected: np.ndarray, partner: np.ndarray | None, margin: float = 1.0
 ) -> np.ndarray:
-    """A vector (M,), or its twin whose overlap with the expected one is larger by a margin, in its phase."""
+    """Return a vector (M,), or its twin if that overlaps more with the expected one, in its phase."""
     overlap = np.vdot(vector, expected)
     if partner is not None:
         other = twin(vector, partner)
@@ -103,7 +104,7 @@ def matched(
 def refine_alignment(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
 ) -> np.ndarray:
-    """Phases and twins (n, M) of largest likelihood, one sample at a time given all others.
+    """Return phases and twins (n, M) of largest likelihood, one sample at a time given all others.
 
     The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
     eq. 5.12).
@@ -129,7 +130,7 @@ def refine_alignment(
 def aligned_by(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
 ) -> np.ndarray:
-    """Vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
+    """Return vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.
@@ -145,7 +146,7 @@ def aligned_to(
     vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
     partner: np.ndarray | None, kernel: Kernel,
 ) -> np.ndarray:  # fmt: skip
-    """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
+    """Return vectors (m, M) complex128 of the phases and twins likeliest given the nearest of aligned ones.
 
     Args:
         vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.

@@ -50,12 +50,12 @@ MASS, VARIANCE = _moment(CORNER)
 
 
 def law_variance(law: Law) -> float:
-    """Of a measurement about the law [dB^2]."""
+    """Return the variance of a measurement about the law [dB^2]."""
     return law.scale**2 * VARIANCE
 
 
 def log_below(z: np.ndarray) -> np.ndarray:
-    """Logarithm of the probability that a residual lies below z (n,) scales."""
+    """Return the logarithm of the probability that a residual lies below z (n,) scales."""
     tail = np.minimum(z, -CORNER)  # exponential: its logarithm is a line, however far out
     far = CORNER**2 / 2 + CORNER * tail - math.log(CORNER)
     edge = math.exp(-(CORNER**2) / 2) / CORNER
@@ -66,7 +66,7 @@ def log_below(z: np.ndarray) -> np.ndarray:
 
 
 def misfit(residual: np.ndarray, side: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
-    """Negative log likelihood of residuals (n,) [dB], its slopes by each residual (n,) and by log(scale).
+    """Return the negative log likelihood of residuals (n,) [dB], its slopes by each (n,) and by log(scale).
 
     Where `side` (n,) is 1 or -1 the residual is of a level that the power lies below or above.
     """
@@ -89,7 +89,7 @@ def _posterior(p: np.ndarray, decades: np.ndarray, rows: Rows) -> tuple[float, l
 
 
 def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float, np.ndarray]:
-    """Negative log posterior and its (level, exponent, log scale) for known decades (n,) of distance."""
+    """Return the least negative log posterior, its (level, exponent, log scale), of decades (n,)."""
 
     def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes, _ = _posterior(p, decades, rows)
@@ -110,7 +110,7 @@ def _start(decades: np.ndarray, rows: Rows) -> np.ndarray:
 
 
 def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
-    """The law of largest likelihood; the floor is chosen by it too.
+    """Return the law of largest likelihood; the floor is chosen by it too.
 
     Args:
         rows: at least one.
@@ -135,7 +135,7 @@ def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
 
 
 def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
-    """The place (3,) [m] of a still end that explains powers best, from several starts.
+    """Return the place (3,) [m] of a still end that explains powers best, from several starts.
 
     Heights above and below the places' own plane fit alike: one of the two is found.
     """
@@ -171,7 +171,7 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
 
 
 def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
-    """The law of powers at a site and what must be said of it: a place that nobody gave is estimated."""
+    """Return the law of powers at a site, and notes: a place that nobody gave is estimated."""
     if rows.places.shape[1] == 6:
         return fit_law(rows, None), ()
     if site.static_position is not None and np.isfinite(site.static_position).all():

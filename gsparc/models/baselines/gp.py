@@ -54,7 +54,7 @@ class Components:
 
 
 def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int = 2048) -> Components:
-    """All components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
+    """Return all components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
 
     Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
     """
@@ -68,6 +68,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
         rows -= means[-1]
         gram += rows @ rows.T
         energy += float((rows**2).sum())
+    # n centred rows span n - 1 directions.
     keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
     values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
     solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
@@ -77,12 +78,13 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
     axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
+    # A small difference of large sums may round below 0.
     lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
 def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
-    """Length and noise of largest leave-one-out likelihood, from three starting lengths.
+    """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
         positions: (n, 3) [m].
@@ -90,6 +92,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
         entries: real numbers per target, P or more.
     """
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+    # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
         return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
@@ -149,7 +152,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         return (*notes, *thinned)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """Of rows too many for one factor: components of rows that cover the site, scores by the nearest."""
+        """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
+        # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
         start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
@@ -196,12 +200,13 @@ class GaussianProcess(Differentiable, ClosedForm):
         assert self.scores is not None
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._composed(result.mean, dtype)
+        # What the components leave out is an error of every prediction.
         variance = (kernel.amplitude * result.left + self.lost).to(dtype)
         unknown = (result.left / (1 + kernel.noise)).to(dtype)
         return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
-        """The mean (B, ...) of `predict` alone: the variance is most of a prediction."""
+        """Return the mean (B, ...) of `predict` alone: the variance is most of a prediction."""
         assert self.site is not None
         places, dtype = query.places(self.site), query.tx.dtype
         if self.powers is not None:
@@ -220,7 +225,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Nothing: what a component contributes stands in the process."""
+        """Return nothing: what a component contributes stands in the process."""
         return {}
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
@@ -264,7 +269,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 def projected(
     targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
 ) -> tuple[np.ndarray, float]:
-    """Scores (n, P) float32 of stored targets (n, ...), and the mean square per real number beyond them.
+    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond them.
 
     `block` targets are floats at a time.
     """
@@ -279,7 +284,7 @@ def projected(
 def kernel_given_nearest(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
-    """Length and noise most likely given the nearest rows, by the strongest components, and a note.
+    """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
 
     Args:
         places, scores: (n, D) [m] and (n, P) float32.
@@ -289,6 +294,7 @@ def kernel_given_nearest(
     """
     row = covering(places, LOOKED_AT, seed)
     near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
+    # A row need not come first among its neighbours, as others may lie at its place.
     own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
     rows = np.c_[row, np.take_along_axis(near, own, 1)]
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
@@ -339,5 +345,5 @@ class ReducedMean(View):
         return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
 
     def size(self) -> int:
-        """Components kept."""
+        """Return the number of components kept."""
         return len(self._axes)

@@ -45,8 +45,10 @@ class Interpolator(Method):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = TimeBudget()
+        # Before learning, which asks for the kind and shape of targets.
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         places, targets, side = data.moving[rows], training_targets(data, rows), data.side(rows)
+        # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
         before = set(vars(self))
         if self.uses_censored and side.any():
             notes = self._learn_censored(places, targets, side)
@@ -68,10 +70,11 @@ class Interpolator(Method):
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
+        # NumPy has no autograd: methods with gradients are `Differentiable`.
         return self._look_up(queries.detach().numpy())
 
     def state(self) -> dict[str, Any]:
-        """Target shape, number of rows, and what the subclass learned."""
+        """Return the target shape, the number of rows, and what the subclass learned."""
         return {"shape": list(self.shape), "seen": self.seen, **self._learned()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -80,12 +83,12 @@ class Interpolator(Method):
         self._relearn(state)
 
     def size(self) -> int:
-        """Number of stored training samples."""
+        """Return the number of stored training samples."""
         return self.seen
 
     @property
     def kind(self) -> Kind:
-        """Of the targets that were learned."""
+        """Kind of the targets that were learned."""
         assert self.site is not None
         return self.site.kind
 
@@ -94,7 +97,7 @@ class Interpolator(Method):
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+        """Learn positions (n, 3) float64 [m] and stored targets (n, ...); return notes for the report."""
 
     def _learn_censored(
         self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
@@ -110,7 +113,7 @@ class Interpolator(Method):
         return {name: getattr(self, name) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        """Inverse of what `stored` names; what cannot be stored is made again by who overrides this."""
+        """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
             setattr(self, name, state[name])
 

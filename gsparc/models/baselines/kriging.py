@@ -56,7 +56,7 @@ class Variogram:
 
 
 def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> Variogram:
-    """Least squares, weighed by the number of pairs, on the empirical variogram up to half the extent.
+    """Fit the empirical variogram up to half the extent by least squares, weighed by the number of pairs.
 
     Args:
         positions: (n, 3) [m].

@@ -16,7 +16,7 @@ from gsparc.models.uplink.interface import UplinkMethod, rms
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
-PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the Gram matrix's mean diagonal
 
 
 class Ridge(UplinkMethod):
@@ -44,10 +44,12 @@ class Ridge(UplinkMethod):
                 self.maps, self.unit = _solve(*normal, penalty), unit
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
                 miss = self.predict(batch).mean - batch.target
+                # Mean of logarithms: a few channels in deep fades would decide a mean of ratios.
                 value = float((_power(miss) / _power(batch.target)).log10().mean())
                 if best is None or value < best[0]:
                     best = value, penalty, unit
         assert best is not None
+        # Validation rows chose the penalty, and are learned from after that.
         every = np.concatenate([fold.train, fold.val])
         self.unit = best[2]
         self.maps = _solve(*self._normal(data, every, self.unit), best[1])

@@ -54,18 +54,18 @@ class Slot:
         ).to(whole.dtype)
 
     def places(self, moving: Tensor, rotation: Tensor) -> Tensor:
-        """Places (B, 3) float64 [m] of this antenna; of the moving end (B, 3) and its turns (B, 3, 3)."""
+        """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3) and turns (B, 3, 3)."""
         if not self.element.any():
             return moving
         return moving + rotation @ self.element
 
     def state(self) -> dict[str, Any]:
-        """What `read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
+        """Return what `read` reads; a checkpoint holds finite numbers, so that an unknown place is none."""
         return {**vars(self), "end": self.end[:0] if self.end.isnan().any() else self.end}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Slot:
-        """Inverse of `state`."""
+        """Make the slot whose `state` this was."""
         end = state["end"] if len(state["end"]) else torch.full((3,), math.nan, dtype=torch.float64)
         entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
         return cls(**{**state, **entries, "end": end})
@@ -104,13 +104,14 @@ class Group(At):
         return len(self.places)
 
     def take(self, index: Tensor) -> Group:
-        """The rows (m,) of these numbers."""
+        """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
     def drawn(self, rows: float) -> Group:
-        """At most so many rows, drawn evenly."""
+        """Return at most so many rows, drawn evenly."""
         if len(self) <= rows:
             return self
+        # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
         index = np.random.default_rng(0).permutation(len(self))[: int(rows)]
         return self.take(torch.from_numpy(np.sort(index)))
 
@@ -118,13 +119,14 @@ class Group(At):
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
 
     def state(self, factors: Tensor) -> dict[str, Any]:
-        """What `read` reads; targets as measured, of runs of these factors."""
+        """Return what `read` reads; targets as measured, of runs of these factors."""
+        # Groups hold aligned targets, and `aligned` divides by the factors again when they are read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 
     @classmethod
     def read(cls, state: dict[str, Any]) -> Group:
-        """Inverse of `state`."""
+        """Make the group whose `state` this was."""
         return cls(**{**state, "slot": Slot.read(state["slot"])})
 
     @cached_property
@@ -134,13 +136,13 @@ class Group(At):
 
 
 def refuse(site: Site) -> None:
-    """`ValueError` for data that waves of a known length cannot explain."""
+    """Raise a `ValueError` for data that waves of a known length cannot explain."""
     if site.kind != "csi" or site.wavelength is None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 
 
 def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
-    """Groups of the given rows (n,).
+    """Return groups of the given rows (n,).
 
     Args:
         data: kind csi; one end is static, or there are several static stations, or both ends move.
@@ -187,12 +189,14 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
     zero, every = torch.zeros(3, dtype=torch.float64), tuple(range(antennas))
     if not apart:
         return [Slot(station, every, tuple(range(tones)), centre, zero, 2 * math.pi * carrier / LIGHT)]
+    # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
     elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, zero)]
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
+        # Antennas of a moving receiver are offsets in its frame, those of a static one are static ends.
         moves = site.static_end == "tx"
         both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
@@ -204,14 +208,15 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
 
 
 def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
-    """Tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
 
 
 def static_place(site: Site, station: int) -> Tensor:
-    """(3,) float64 [m], local; NaN where unknown."""
+    """Return the place (3,) float64 [m] of a static end, local; NaN where unknown."""
     if site.stations is not None:
         return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
     if site.static_position is None:
@@ -220,7 +225,7 @@ def static_place(site: Site, station: int) -> Tensor:
 
 
 def carrier_of(site: Site, station: int) -> float:
-    """Carrier [Hz] of a station."""
+    """Return the carrier [Hz] of a station."""
     if site.stations is not None and site.stations.carrier_hz is not None:
         return float(site.stations.carrier_hz[station])
     assert site.carrier_hz is not None
@@ -228,7 +233,7 @@ def carrier_of(site: Site, station: int) -> float:
 
 
 def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Moving and static ends' places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
+    """Return moving and static places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
 
     Where both ends move, the moving places are (B, 6).
     A static end that is not where any station stands is of station `NOBODY`.
@@ -243,6 +248,7 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     if site.stations is None:
         return moving, static, turned, torch.zeros(count, dtype=torch.long)
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
+    # NaN would be the minimum: stations at unknown places are infinitely far instead.
     away, nearest = torch.cdist(static, known).nan_to_num(math.inf).min(1)
     lost = known.isnan().any(1)  # an end at an unknown place is the first station at one
     here = static.isnan().any(1) & lost.any()
@@ -251,14 +257,14 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
 
 
 def ends_of(groups: tuple[Group, ...]) -> int:
-    """How many static ends there are."""
+    """Return how many static ends there are."""
     return len({group.slot.station for group in groups})
 
 
 def aligned(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """Factors of runs (runs,) complex128, as measured over the largest one's, and what groups say without.
+    """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
 
     Of several ends that share them phases alone: what a run has changed beside its phase is each end's own,
     and would be taken for a level of all.
@@ -280,11 +286,12 @@ def aligned(
 
 
 def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Negative log likelihood [nats] of what `aligned` says, scales profiled out."""
+    """Return the negative log likelihood [nats] of what `aligned` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
         nll += outputs * (count * math.log(max(given.scale, 1e-300)) + float(given.factor.log_determinant))
+        # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
 
@@ -293,17 +300,19 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
+        # In units of its own power, as groups have scales of their own.
         own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
+    # `aligning` tells what rows are to be multiplied by, the inverse of what they were.
     estimates[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
     measured = torch.from_numpy(estimates)
     return measured / measured.abs() if ends_of(groups) > 1 else measured
 
 
 def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
-    """At most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
+    """Return at most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.
     """

@@ -31,7 +31,7 @@ class Common:
 
     @staticmethod
     def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
-        """From groups, their inverse covariances times targets (n, D), and scales."""
+        """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
             waves, power, away = _waves(prior, group)
@@ -40,8 +40,10 @@ class Common:
         each = torch.stack(gains)
         count, gain = len(each), each.mean(0)
         whole, mean = each.abs().square().mean(0), gain.abs().square()
+        # Unbiased: of n ends |mean|^2 is too large by a variance / n.
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
         spread = (whole - steady) / count
+        # Wiener's factor of the mean: its power over that with its error.
         reliability = steady / (steady + spread).clamp_min(1e-300)
         explained = steady * reliability
         # The direct wave stays: unsure as its gain may be, its shape is right.

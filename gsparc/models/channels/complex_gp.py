@@ -194,7 +194,7 @@ class ComplexGP(ClosedForm):
         self.runs = RunFactors.read(state)
 
     def size(self) -> int:
-        """Training samples kept."""
+        """Return the number of training samples kept."""
         return 0 if self.posterior is None else len(self.posterior.places)
 
 

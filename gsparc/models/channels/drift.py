@@ -24,7 +24,7 @@ LOWEST, HIGHEST = math.log(1e-5), 5.0  # logarithms of shares of the white noise
 
 
 def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
-    """At most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
+    """Return at most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
     stretches = []
     for group in thinned(groups, COLUMNS):
         order = torch.argsort(group.order, stable=True)
@@ -36,7 +36,7 @@ def contiguous_rows(groups: tuple[Group, ...]) -> tuple[Group, ...]:
 def with_drift(
     groups: tuple[Group, ...], signals: list[Tensor], prior: ChannelPrior
 ) -> tuple[ChannelPrior, float]:
-    """The terms with correlated noise, and what evidence gains on `groups` [nats].
+    """Return the terms with correlated noise, and what evidence gains on `groups` [nats].
 
     Args:
         groups: see `contiguous_rows`.

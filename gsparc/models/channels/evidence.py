@@ -94,7 +94,8 @@ def parameters(prior: ChannelPrior) -> Tensor:
 
 
 def normalised(group: Group) -> Group:
-    """The same with targets of unit mean square."""
+    """Return the same with targets of unit mean square."""
+    # A silent group stays 0 instead of 0 / 0.
     level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
     return replace(group, target=group.target / level)
 
@@ -102,11 +103,12 @@ def normalised(group: Group) -> Group:
 def compressed(
     groups: tuple[Group, ...], prior: ChannelPrior, cache: Cache | None = None
 ) -> tuple[Compressed, ...]:
-    """Signals of all groups; those of one set of displacements and one wavelength share the diffuse field's.
+    """Return signals of all groups; of one set of displacements and wavelength they share the basis.
 
     `cache` keeps matrices of places that further candidates and groups need again.
     """
     cache, parts = {} if cache is None else cache, []
+    # Relative to the diffuse field: eigenvalues of its correlation far below are lost in the noise.
     noise = prior.noise / float(prior[Isotropic].power)
     for group in groups:
         key = group.displacements, group.slot.wavenumber, prior.frame.envelope, noise
@@ -119,15 +121,16 @@ def compressed(
 
 
 def without(part: Compressed, left: Tensor) -> Compressed:
-    """The rows but those of `left` (n,) bool, from the same matrices."""
+    """Return the rows but those of `left` (n,) bool, from the same matrices."""
     rest = torch.nonzero(~left).flatten()
+    # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
     pieces = tuple(piece.within(mixed) for piece in part.pieces)
     return Compressed.of(part.group.take(rest), basis, pieces, part.design)
 
 
 def solved(part: Compressed, power: Tensor) -> Solved:
-    """With its own powers (P,)."""
+    """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
     powers = power[:-1].split([piece.count for piece in part.pieces])
@@ -136,6 +139,7 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     covariance.diagonal().add_(noise)
     given = Conditioned.of(covariance, part.target)
     count, outputs = part.group.target.shape
+    # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
     quadratic = given.scale * part.target.numel() + part.rest / noise
     scale = max(quadratic / (count * outputs), 1e-300)
     determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
@@ -143,24 +147,25 @@ def solved(part: Compressed, power: Tensor) -> Solved:
 
 
 def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
-    """Gradient (P,) of the negative log likelihood by logarithms of own powers."""
+    """Return the gradient (P,) of the negative log likelihood by logarithms of own powers."""
     count, outputs = part.group.target.shape
     weights = at.given.weights
     weight = at.given.factor.inverse.addmm(weights, weights.mH, beta=outputs, alpha=-1 / at.scale)
     noise = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[-1]
+    # Slope of `rest / (scale noise)`, the quadratic form outside the basis.
     noise = noise - part.rest / (at.scale * power[-1] ** 2)
     return torch.cat([*(piece.traces(weight) for piece in part.pieces), noise[None]]) * power
 
 
 def evidence(parts: tuple[Compressed, ...], prior: ChannelPrior) -> float:
-    """Negative log marginal likelihood of all groups [nats]."""
+    """Return the negative log marginal likelihood of all groups [nats]."""
     return sum(solved(part, part.own(prior)).nll for part in parts)
 
 
 def fit_powers(
     parts: tuple[Compressed, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
 ) -> tuple[ChannelPrior, float]:
-    """With parameters of largest evidence, its negative logarithm without the priors.
+    """Fit parameters of largest evidence; return its negative logarithm without the priors too.
 
     Args:
         parts: of the groups.
@@ -201,9 +206,9 @@ def minimised(
     start: Tensor,
     bounds: list[tuple[float, float]],
     steps: int,
-    settled: float = 1e7 * torch.finfo(torch.float64).eps,
+    settled: float = 1e7 * torch.finfo(torch.float64).eps,  # SciPy's own default of `ftol`
 ) -> tuple[Tensor, float]:
-    """Where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
+    """Return where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
 
     def told(at: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = objective(torch.from_numpy(at))
@@ -217,12 +222,13 @@ def minimised(
 
 
 def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
-    """Errors (n, D) of rows left out with their group, of each grouping (Rasmussen and Williams 2006, 5.12).
+    """Return errors (n, D) of rows left out in groups, of each grouping (Rasmussen and Williams, 5.12).
 
     Powers (P,) are its own.
     """
     at, noise, wide = solved(part, power), power[-1], part.basis.to(torch.complex128)
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
+    # The inverse is that of the covariance in the basis, and 1 / noise on what is orthogonal to it.
     outside = torch.eye(len(wide), dtype=torch.float64) - part.basis @ part.basis.T
     inverse = wide @ at.given.factor.inverse @ wide.mH + outside / noise
     return [left_out_rows(inverse, alpha, groups)[0] for groups in groupings]

@@ -61,13 +61,14 @@ class Weights:
         lower = whole.real.contiguous() if self.is_real else whole
         root = Factor(lower).root
         few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
+        # A query reads all n^2 entries of the root, of which single precision has half the bytes.
         short = root.to(torch.float32 if self.is_real else torch.complex64)
         squares = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
         error = (squares - few.abs().square().sum(1)).abs().max()
         return short if float(error) <= ROUNDED * self.noise else root
 
     def learned(self, cross: Tensor) -> Tensor:
-        """Variance (m,) that the rows take away from places of covariances (m, n) with them."""
+        """Return the variance (m,) that the rows take away from places of covariances (m, n) with them."""
         cross = (cross.real if self.is_real else cross).to(self.root.dtype)
         return (cross.conj() @ self.root.T).abs().square().sum(1)
 
@@ -110,7 +111,7 @@ class ChannelField(ClosedForm):
         return self.prior.get(Direct) is not None or self.size() > 0
 
     def size(self) -> int:
-        """Images."""
+        """Return the number of images."""
         images = self.prior.get(Images)
         return 0 if images is None else len(images.planes)
 
@@ -120,7 +121,7 @@ class ChannelField(ClosedForm):
         return tuple(term.name for term in self.prior.terms if term.name)
 
     def objects(self) -> SiteObjects:
-        """The mirror planes that static ends share."""
+        """Return the mirror planes that static ends share."""
         images = self.prior.get(Images)
         return SiteObjects.of(planes=None if images is None else images.planes.numpy())
 
@@ -151,6 +152,7 @@ class ChannelField(ClosedForm):
         for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
         heard = [(known.group, known.given.weights, known.scale) for known in self.weights]
+        # One end alone does not tell what ends have in common.
         self.common = Common.of(prior, heard) if len(self.stations) > 1 else None
 
     def predict(self, query: Query) -> Prediction:
@@ -159,6 +161,7 @@ class ChannelField(ClosedForm):
         Without stations those at the static places are asked, the first of several at one. Of one that no
         row was learned of, what ends have in common answers (`Common`).
         """
+        # The longest group's covariance with a chunk is the largest matrix of an answer.
         longest = max(len(each.group) for each in self._conditioned())
         moving, static, turned, station = query_ends(self.site, query.tx, query.rx)
         if query.station is not None and self.site.stations is not None:
@@ -183,6 +186,7 @@ class ChannelField(ClosedForm):
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
         prior, images, size = self.prior, self.prior.get(Images), math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
+        # Without images it is not told, and needs no memory of its own.
         share = mean if images is None else torch.zeros_like(mean)
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
@@ -190,6 +194,7 @@ class ChannelField(ClosedForm):
         def tell(slot: Slot, here: Tensor, said: Tensor, left: Tensor, whole: Tensor) -> None:
             slot.put(mean, here, said)
             for total, part in ((after, left), (before, whole)):
+                # Variances are means over all A K entries, of which this slot has so many.
                 total.index_add_(0, here, part * (said.shape[1] / size))
 
         for alike in self._by_places(moving, turned, station):
@@ -198,6 +203,7 @@ class ChannelField(ClosedForm):
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
                 if images is not None:
                     at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
+                # In float64 slopes of variances are asked for, which a rounded root would spoil.
                 removed = known.given.known(cross) if exact else known.learned(cross)
                 whole = prior.variance(at) + prior.disturbed
                 left = known.scale * (whole - removed).clamp_min(0)
@@ -205,9 +211,11 @@ class ChannelField(ClosedForm):
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (static == place).all(1)).flatten()
-            assert self.common is not None
+            if self.common is None:
+                raise ValueError("waves: one static end was learned from, which tells nothing of another")
             for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
                 slot, outputs = known.group.slot, known.group.target.shape[1]
+                # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
                 at = At(slot, slot.places(moving[here], turned[here]))
                 common, left, whole = self.common.at(prior, at)
@@ -243,6 +251,7 @@ class ChannelField(ClosedForm):
             assert error is not None
             predicted = group.target - residual
             group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+            # Weighed by entries of the group, as the sum is divided by those of all groups.
             level = known.scale * outputs * self.runs.factors[group.run].abs().square()
             variance.index_add_(0, group.rows, error * level)
             entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))

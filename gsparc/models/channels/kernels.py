@@ -22,17 +22,17 @@ FLAT_RAD = 0.5  # phase over the height of places, below which waves from above 
 
 
 def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Matern-3/2 of distances [m]."""
+    """Return Matern-3/2 of distances [m]."""
     return matern32_of_squares((distance / length).square())
 
 
 def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Squared exponential of distances [m]."""
+    """Return the squared exponential of distances [m]."""
     return torch.exp(-0.5 * (distance / length).square())
 
 
 def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
-    """Correlation (...) complex128 of waves that come from about one direction.
+    """Return the correlation (...) complex128 of waves that come from about one direction.
 
     Args:
         squared: (...) float64, (k d)^2 of displacements d.
@@ -57,7 +57,7 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
 
 
 def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
-    """Correlation (..., n, m) float64 of waves from everywhere alike within an envelope's length [m].
+    """Return the correlation (..., n, m) float64 of waves from everywhere alike, in an envelope [m].
 
     Where both ends move, waves leave in all directions as they arrive from all: the product over the ends.
 
@@ -68,7 +68,7 @@ def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Te
 
 
 def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
-    """Spherical wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
+    """Return the wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
     away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
     # The amplitude stops growing a quarter of a wavelength away, where no antenna is a point.
     level = reference / (away.square() + (math.pi / 2 / wavenumber) ** 2).sqrt()
@@ -76,7 +76,7 @@ def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tenso
 
 
 def sphere(count: int) -> Tensor:
-    """Unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
+    """Return unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
     height, turn = 1 - 2 * number / count, math.pi * (1 + 5**0.5) * number
     radius = (1 - height.square()).sqrt()
@@ -84,7 +84,7 @@ def sphere(count: int) -> Tensor:
 
 
 def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
-    """`count` directions (count, 3): of the sphere, or of a half where places (n, 3) are in one plane."""
+    """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3) lie in a plane."""
     centred = places - places.mean(0)
     axes = torch.linalg.svd(centred, full_matrices=False)[2] if len(places) > 2 else torch.eye(3).double()
     height = (centred @ axes[-1]).abs().max()
@@ -98,7 +98,7 @@ def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
 
 
 def cells(places: np.ndarray, depth: int) -> np.ndarray:
-    """Numbers (n,) of 2^depth cells of nearby places (n, 3): halved `depth` times across the widest axis."""
+    """Return numbers (n,) of 2^depth cells of near places (n, 3), halved across the widest axis."""
     number = np.zeros(len(places), np.int64)
     for _ in range(depth):
         after = number * 2

@@ -103,7 +103,7 @@ def find_mirrors(
     coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], prior: ChannelPrior,
     wavelength: float, most: int,
 ) -> Tensor:  # fmt: skip
-    """Planes (W, 4) float64, local; none where all together are not worth it.
+    """Return planes (W, 4) float64, local; none where all together are not worth it.
 
     Args:
         coarse: few rows of few ends, for the grid.
@@ -132,7 +132,7 @@ def find_mirrors(
 
 
 def candidates(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
-    """Upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
+    """Return upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
     points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])
     extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))

@@ -35,6 +35,7 @@ class ChannelPrior:
     def changed(self, *terms: ChannelTerm) -> ChannelPrior:
         """Return the prior with these in place of their kinds; those without powers are left out."""
         kinds = {type(term): term for term in (*self.terms, *terms)}
+        # In the order of `KINDS`: parameters of terms stand one after the other in vectors.
         ordered = (kinds[kind] for kind in dict.fromkeys([*KINDS, *kinds]) if kind in kinds)
         return ChannelPrior(tuple(term for term in ordered if len(term.power)))
 
@@ -76,6 +77,7 @@ class ChannelPrior:
     def together(self, a: Sequence[At], b: Sequence[At]) -> Iterator[Tensor]:
         """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.together`."""
         for parts in zip(*(term.together(a, b) for term in self.signals), strict=True):
+            # From the first part on: `0 + tensor` would copy a matrix for nothing.
             yield sum(parts[1:], parts[0]).to(torch.complex128)
 
     def of_groups(self, groups: Sequence[Group]) -> list[Tensor]:

@@ -45,7 +45,7 @@ class Probe:
 
     @staticmethod
     def of(part: Compressed, prior: ChannelPrior) -> Probe:
-        """With the group's own powers."""
+        """Factor a group's covariance with its own powers."""
         at, basis, noise = solved(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
@@ -53,7 +53,7 @@ class Probe:
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
     def known(self, waves: Tensor) -> Tensor:
-        """f^H C^-1 f (m,) float64 of waves (m, n)."""
+        """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
         inside, basis, downdate = (
             (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
         )
@@ -61,7 +61,7 @@ class Probe:
         return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
     def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
-        """Rise of the log likelihood (m,) [nats] with each of waves (m, n) complex128 alone, of some power.
+        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
 
         `known` (m,) stands in for `known(waves)`.
         """
@@ -70,7 +70,7 @@ class Probe:
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
 
     def added(self, wave: Tensor, level: float) -> Probe:
-        """With a wave (n,) of some power among the terms."""
+        """Return the probe with a wave (n,) of some power among the terms."""
         own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
         own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
         share = level / (1 + level * float((wave.conj() @ own).real))
@@ -82,7 +82,7 @@ def summed_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
     known: Callable[[Probe, Tensor], Tensor] = Probe.known,
 ) -> Tensor:  # fmt: skip
-    """Rise of the log likelihood (count, levels) of all groups; `waves` (m, n) of some numbers (m,)."""
+    """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
         for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
@@ -93,7 +93,7 @@ def summed_gains(
 
 
 def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
-    """The offset (3,) float64 [m] of largest likelihood on a grid that is refined, or None for none better.
+    """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """

@@ -167,7 +167,7 @@ class DirectionalGP(SourcesInFrame):
         return gain.mT, at.away, self.posterior.positions.points
 
     def left_out(self) -> LeftOutRows:
-        """Receivers, each predicted from all others; its own visibility of the sources is left out, too."""
+        """Return receivers, each predicted from all others; its own visibility is left out, too."""
         return self._fitted().left_out(self.posterior.rows, self.posterior.left_out())
 
     def state(self) -> dict[str, Any]:
@@ -185,5 +185,5 @@ class DirectionalGP(SourcesInFrame):
         return ("phase", "visibility")
 
     def size(self) -> int:
-        """Sources."""
+        """Return the number of sources."""
         return len(self.posterior.power) if self.site is not None else 0

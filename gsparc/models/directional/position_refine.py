@@ -58,23 +58,23 @@ class UncertainPositions:
         return Factor.of(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64), "raise").lower
 
     def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
+        """Return (K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
         slope = wave_vectors(self.points, places, frequency)
         return (slope @ self.lower).to(dtype)
 
     def only(self, index: Tensor) -> UncertainPositions:
-        """A subset of the sources."""
+        """Return a subset of the sources."""
         return UncertainPositions(self.points[index], self.covariance[index])
 
     def uncertain(self, places: Tensor, frequency: Tensor) -> Tensor:
-        """Indices of the sources that are not coherent over these places."""
+        """Return indices of the sources that are not coherent over these places."""
         phase_vectors = self.phase_vectors(places, frequency)
         spread = (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
         return torch.nonzero(spread > SHARP_RAD).flatten()
 
 
 def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
-    """(K, n, 3) float64 [rad/m], gradients of the received phases by the sources' positions, up to a sign."""
+    """Return gradients (K, n, 3) float64 [rad/m] of received phases by sources' positions, up to a sign."""
     towards = points[:, None] - places[None]
     away = torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-3)
     hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
@@ -82,7 +82,7 @@ def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
 
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
-    """(K, m, n), of `phase_vectors` (K, m, 3) and (K, n, 3)."""
+    """Return (K, m, n), of `phase_vectors` (K, m, 3) and (K, n, 3)."""
     return apart(first, second).square().mul_(-0.5).exp_()
 
 
@@ -109,7 +109,7 @@ class PositionRefinement:
         self.wavelength = LIGHT / float(self.rows.frequency.mean())
 
     def run(self) -> UncertainPositions:
-        """Positions and covariances given rays and channels."""
+        """Return positions and covariances given rays and channels."""
         uncertain = self.prior.uncertain(self.rows.position, self.rows.frequency)
         if not len(uncertain):
             return self.current  # directions were exact: nothing to refine
@@ -136,7 +136,7 @@ class PositionRefinement:
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
 
     def total(self, without: int | None = None) -> Tensor:
-        """Covariance (n, n) of the rows by all sources but one."""
+        """Return the covariance (n, n) of the rows by all sources but one."""
         power = self.power.to(self.terms.dtype)
         if without is not None:  # a difference of covariances need not be positive definite
             power[without] = 0
@@ -215,7 +215,7 @@ class ConditionalLikelihood:
         return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
 
     def separated(self, points: Tensor, distance: float) -> Tensor:
-        """The best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
+        """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
         log_posterior = self.log_posterior(points)
         best: list[Tensor] = []
         while len(best) < REFINED and float(log_posterior.max()) > -torch.inf:
@@ -224,7 +224,7 @@ class ConditionalLikelihood:
         return torch.stack(best)
 
     def refined(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (m, 3) after Gauss-Newton steps under the best gain, and covariances (m, 3, 3)."""
+        """Return positions (m, 3) after Gauss-Newton steps at the best gain, and covariances (m, 3, 3)."""
         best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
         for _ in range(STEPS):
             step, _ = self._step(points)

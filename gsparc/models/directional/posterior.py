@@ -49,7 +49,7 @@ class GainKernel:
     noise: float
 
     def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(n, m) of places (n, 3) and (m, 3) float64 [m]."""
+        """Return the correlation (n, m) of places (n, 3) and (m, 3) float64 [m]."""
         squared = (apart(first, second) / self.length).square()
         return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
 
@@ -137,13 +137,14 @@ class SightedSources:
         return in_double(self.prepared())
 
     def prepared(self) -> SightedSources:
-        """Itself, with what all queries need; tensors made within the first might be for inference only."""
+        """Return itself, with what all queries need; what the first makes might be for inference only."""
         assert len(self.dual_weights) == len(self.rows)
         return self
 
     def learned(self) -> SightedSources:
-        """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
+        # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
         coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
         for _ in range(ROUNDS):
@@ -157,11 +158,12 @@ class SightedSources:
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
             known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
+            # A power of 0 would stay 0 for ever: every update is proportional to it.
             power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
         return replace(self, power=power, kernel=kernel)
 
     def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
-        """Geometry of places (m, 3) [m] and frequencies (m,) or () [Hz]; probability (m, K) where known."""
+        """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K) if known."""
         dtype = self.power.dtype
         probability = self.visibility.probability(places) if probability is None else probability
         retained = torch.zeros(0, len(places), len(self.rows), dtype=dtype)
@@ -172,11 +174,11 @@ class SightedSources:
         return Arrival(ranges(places, self.positions.points), probability.to(dtype), correlation, retained)
 
     def at_rows(self, probability: Tensor) -> Arrival:
-        """The rows' own geometry, with the probability (receivers, K) that each sees each source."""
+        """Return the rows' own geometry, with the probability (receivers, K) that each sees each source."""
         return self.at(self.rows.position, self.rows.frequency, probability[self.observer])
 
     def gains(self, at: Arrival) -> Tensor:
-        """Posterior mean gains (m, K, R) where they are seen."""
+        """Return the posterior mean gains (m, K, R) where they are seen."""
         weights = self.dual_weights
         gain = (at.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
         if len(self.uncertain):
@@ -185,22 +187,24 @@ class SightedSources:
         return torch.view_as_complex(gain)
 
     def variance(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
-        """Expected squared error and expected power (m,); of gains, noise and visibility."""
+        """Return the expected squared error and expected power (m,); of gains, noise and visibility."""
         probability, noise = at.probability, self.kernel.noise
         arriving = wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
         cross = self._cross(arriving * probability, at.retained, self.power) * at.correlation
         gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
+        # Variance p (1 - p) of a source that is seen or not, times its power.
         of_visibility = (powers * probability * (1 - probability)).sum(1)
         return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise
 
     def left_out(self) -> Tensor:
-        """The rows (n, R), each receiver and its own visibility left out."""
+        """Return the rows (n, R), each receiver and its own visibility left out."""
         at = self.at_rows(self.visibility.left_out)
         cross = self._cross(self.unobstructed * at.probability, at.retained, self.power) * at.correlation
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in groups_of(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
             predicted[group] -= cross[group] @ (inverse[:, group] @ own)
         return predicted
 
@@ -213,6 +217,7 @@ class SightedSources:
     def _cross(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
         """Covariance (m, n) of waves (m, K) with the rows, before the correlation over places."""
         uncertain = self.uncertain
+        # Certain sources together in one product; each uncertain one has a coherence of its own.
         exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
         total = (waves * exact) @ self.waves.mH
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):

@@ -52,7 +52,7 @@ class Rays:
 
     @staticmethod
     def of(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
-        """From one array (paths, 3) per receiver."""
+        """Gather one array (paths, 3) per receiver."""
         flat = np.concatenate([np.zeros((0, 3)), *rays])
         flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
         return Rays(places, flat, np.repeat(np.arange(len(rays)), [len(r) for r in rays]))
@@ -61,11 +61,11 @@ class Rays:
         return len(self.owner)
 
     def take(self, mask: np.ndarray) -> Rays:
-        """A subset, of the same receivers."""
+        """Return a subset, of the same receivers."""
         return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
-        """Squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
+        """Return squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
         ahead = points @ self.direction.T - np.einsum("nc,nc->n", self.places[self.owner], self.direction)
         away = np.linalg.norm(points[:, None] - self.places[None], axis=-1)
         return np.maximum(2 - 2 * ahead / np.maximum(away, 1e-9)[:, self.owner], 0.0)
@@ -88,7 +88,7 @@ class RayClusters:
     error: float
 
     def seen(self, rays: Rays) -> np.ndarray:
-        """(n, K), 1 where a receiver has a ray from a point, else 0."""
+        """Return (n, K), 1 where a receiver has a ray from a point, else 0."""
         table = np.zeros((len(rays.places), len(self.points)))
         k, ray = np.nonzero(self.responsibility > 0.5)
         table[rays.owner[ray], k] = 1.0
@@ -96,7 +96,7 @@ class RayClusters:
 
 
 def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
-    """All points where rays intersect, by falling evidence."""
+    """Return all points where rays intersect, by falling evidence."""
     rng = np.random.default_rng(seed)
     empty = RayClusters(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, len(rays))), MAX_ERROR)
     error = _initial_error(rays, rng)
@@ -116,7 +116,7 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
 
 
 def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
-    """Expectation maximisation over points and rays, without duplicates and points of too little evidence."""
+    """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
     while True:
         covariance, responsibility = np.zeros((0, 3, 3)), np.zeros((0, len(rays)))
         rate: np.ndarray | float = 1.0

@@ -49,7 +49,7 @@ class VisibilityGP:
 
     @staticmethod
     def of(places: Tensor, seen: Tensor) -> VisibilityGP:
-        """From the visibility of K sources at n receivers."""
+        """Learn from the visibility of K sources at n receivers."""
         apart, mean = torch.cdist(places, places), seen.mean(0)
         length, weights = torch.full_like(mean, LENGTHS_M[-1]), torch.zeros_like(seen)
         left_out = mean.expand_as(seen).clone()  # without a better kernel the mean
@@ -70,7 +70,7 @@ class VisibilityGP:
         return VisibilityGP(places, seen, length, weights, left_out)
 
     def probability(self, places: Tensor) -> Tensor:
-        """Probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
+        """Return the probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
         lengths, weights = self._by_length
         correlation = matern32_of_squares((apart(places, self.places)[:, None] / lengths).square()).flatten(1)
         return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
@@ -100,12 +100,12 @@ class RayErrorRates:
 
     @staticmethod
     def first(rays: Tensor) -> RayErrorRates:
-        """Initial rates from rays (n, K), as if all receivers saw the source with most rays."""
+        """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
     @staticmethod
     def of(rays: Tensor, seen: Tensor) -> RayErrorRates:
-        """From rays and visibility, both (n, K) of zeros and ones."""
+        """Estimate from rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
         return RayErrorRates(max(missed, MIN_RATE), max(spurious, MIN_RATE))
@@ -119,7 +119,7 @@ class RayErrorRates:
 
 
 def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
-    """(n, K) bool, at most one visibility entry to change per receiver.
+    """Return (n, K) bool, at most one visibility entry to change per receiver.
 
     Args:
         seen: (n, K) of zeros and ones.

@@ -43,7 +43,7 @@ def score(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
-    """`|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
+    """Return `|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
 
     Candidates are (m, 3), or (E, m, 3) as in `score`.
     """
@@ -79,7 +79,7 @@ def search_box(
     posterior: Posterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
     spread: Spread,
 ) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
-    """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
+    """Return the best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
     `spread` gives the images of the static end's antennas, as `score` takes them.
@@ -108,7 +108,7 @@ def pick_apart(
     position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0,
     known: Tensor | None = None,
 ) -> list[int]:  # fmt: skip
-    """Indices of the best scores (n,) of at least `threshold`, positions (n, 3) `min_distance` [m] apart.
+    """Return indices of the best scores (n,) of at least `threshold`, `min_distance` [m] apart by positions.
 
     Also from those that are `known` (K, 3).
     """

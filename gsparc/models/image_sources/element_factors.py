@@ -24,14 +24,14 @@ UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before an
 
 
 def direct_path(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
-    """The static end (3,) [m] alone, with its share of the power of unit rows."""
+    """Return the static end (3,) [m] alone, with its share of the power of unit rows."""
     scene = Scene.direct(static, torch.zeros(1), math.log(UNEXPLAINED))
     power = (1 - UNEXPLAINED) / scene.waves(rows).abs().square().mean()
     return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 
 
 def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
-    """What channels of each antenna must be multiplied by, (E,) complex64, the first by 1; None: nothing.
+    """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
 
     Args:
         rows: of a static array of E antennas, one output; those without a row are multiplied by 1.

@@ -44,7 +44,7 @@ def search_many(
     cache: SearchCache,
     look: Look | None = None,
 ) -> list[Member]:
-    """One search per set of rows, best first; at least one, others while the budget lasts.
+    """Run one search per set of rows, best first; at least one, others while the budget lasts.
 
     The first two that have reached the noise floor are the last: searches of higher numbers do not start, or
     end without a result, whichever of them is finished first.
@@ -143,13 +143,13 @@ def raced(race: Race, group: np.ndarray, missed: Callable[[Rows, Scene], Tensor]
 
 
 def refined(rows: Rows, member: Member) -> Member:
-    """A search's result on rows that have changed a little."""
+    """Return a search's result on rows that have changed a little."""
     scene = refine(rows, member.scene, 20)
     return Member(scene, left_out_error(rows, scene), member.number)
 
 
 def left_out_error(rows: Rows, scene: Scene) -> float:
-    """NMSE of the rows, each receiver predicted from the others."""
+    """Return the NMSE of the rows, each receiver predicted from the others."""
     error = rows.target - Posterior(rows, scene).left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
@@ -165,6 +165,6 @@ def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2
 
 
 def weights_of(members: list[Member]) -> Tensor:
-    """Weights of the searches in the average, (M,) float32 of sum 1."""
+    """Return weights of the searches in the average, (M,) float32 of sum 1."""
     error = torch.tensor([max(member.left_out, 1e-6) for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

@@ -54,29 +54,31 @@ class Frame:
         return Frame(site, antennas, rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
     def inside(self, rows: Rows) -> Rows:
-        """Rows in local metres and stored units, normalised."""
+        """Return rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
 
     def places(self, query: Query) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the frame, and B.
+        """Return antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
         rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
         position = query.rx.position if self.site.moving_end == "rx" else query.tx
+        # float64: phases need lengths to a fraction of a wavelength.
         position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
     def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
-        """Of normalised predictions (n, R) of the rows; of one channel per receiver."""
+        """Turn normalised predictions (n, R) of the rows back; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
+        # NaN: who needs a variance takes that of a prediction at the place.
         unknown = torch.full((len(predicted),), float("nan"))
         return LeftOutRows(rows.receiver.numpy(), (predicted * scale)[:, :, None], unknown)
 
     def state(self) -> dict[str, Any]:
-        """What makes it again, of the same site."""
+        """Return what makes it again, of the same site."""
         return {name: value for name, value in vars(self).items() if name != "site"}
 
 
@@ -113,12 +115,13 @@ class SourcesInFrame(ClosedForm):
         tones = torch.from_numpy(frame.site.tones())
         mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
+        # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
         variance, prior = (each.reshape(count, -1).mean(1) for each in (variance, prior))
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """The paths that `predict` sums, one per source: of several searches, with the search's weight.
+        """Return the paths that `predict` sums, one per source: of several searches by the search's weight.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
@@ -141,7 +144,7 @@ class SourcesInFrame(ClosedForm):
 
 
 def refuse(site: Site, name: str) -> None:
-    """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
+    """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
@@ -149,7 +152,7 @@ def refuse(site: Site, name: str) -> None:
 
 
 def refuse_turning(data: Measurements) -> None:
-    """`ValueError` where a static receiver of several antennas turns between measurements."""
+    """Raise a `ValueError` where a static receiver of several antennas turns between measurements."""
     antennas = data.target.shape[1]
     if static_array(data.site, antennas) is None:
         return

@@ -29,7 +29,8 @@ from gsparc.processes.conditioned import Conditioned
 
 
 def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
-    """Targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    """Return targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
     covariance.diagonal().add_(noise + JITTER * level)
     return Conditioned.of(covariance, target)
@@ -49,18 +50,20 @@ class CircularGains:
 
     def add(self, scaled: Tensor, correlation: Tensor) -> None:
         """Add one source, `(s a)(s a)^H * C`."""
+        # With a = p + j q: a a^H = (p p^T + q q^T) + j (q p^T - p q^T).
         pair = torch.stack([scaled.real, scaled.imag], 1)
         turned = torch.stack([scaled.imag, -scaled.real], 1)
         self._real.addcmul_(correlation, pair @ pair.T)
         self._imag.addcmul_(correlation, turned @ pair.T)
 
     def given(self, noise: Tensor | float) -> Conditioned:
-        """The rows' targets given the covariance with noise of this variance."""
+        """Return the rows' targets given the covariance with noise of this variance."""
+        # In place and for good: `Posterior.conditioned` calls it once.
         self._real.diagonal().add_(noise)
         return Conditioned.of(self.matrix, self.target)
 
     def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
-        """Derivatives (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
+        """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
         for k, one in enumerate(correlation):
@@ -70,21 +73,21 @@ class CircularGains:
         return 2 * slopes
 
     def by_noise(self, slope: Tensor) -> Tensor:
-        """The derivative () by the variance of the noise."""
+        """Return the derivative () by the variance of the noise."""
         return slope.diagonal().real.sum()
 
     def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
-        """Derivatives (n, n) by the correlation of one source."""
+        """Return derivatives (n, n) by the correlation of one source."""
         return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
 
 def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
-    """p and q, each (2 n, ...) float32, of complex (n, ...)."""
+    """Return p and q, each (2 n, ...) float32, of complex (n, ...)."""
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
 def shares(quadrature: Tensor | float) -> Tensor:
-    """Variance along and across a gain's phase, (2,)."""
+    """Return the variance along and across a gain's phase, (2,)."""
     return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
 
@@ -107,7 +110,7 @@ class PhasedGains(CircularGains):
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
     def given(self, noise: Tensor | float) -> Conditioned:
-        """The rows' targets, half of the noise in either part."""
+        """Return the rows' targets, half of the noise in either part."""
         self.matrix.diagonal().add_(noise / 2)
         return Conditioned.of(self.matrix, stacked(self.target)[0])
 
@@ -124,12 +127,14 @@ class PhasedGains(CircularGains):
 
     def by_noise(self, slope: Tensor) -> Tensor:
         """See `CircularGains`."""
+        # Half of the noise is in either part, and of real values d nll is half of trace(G dK).
         return slope.diagonal().sum() / 4
 
     def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """See `CircularGains`; differentiable in `quadrature`."""
         n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
         along, across = ((slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stacked(scaled))
+        # Half, as d nll of real values is half of trace(G dK) (`Conditioned.slope`).
         return ((1 - share) * along + share * across) / 2
 
 
@@ -145,14 +150,14 @@ class Posterior:
         return self.scene.waves(self.rows)
 
     def gains(self) -> CircularGains:
-        """Of no source yet."""
+        """Return the covariance of no source yet."""
         if self.scene.phase is None:
             return CircularGains(self.rows)
         return PhasedGains(self.rows, self.scene.quadrature)
 
     @cached_property
     def summed(self) -> CircularGains:
-        """Of all sources, without noise until it is `given`."""
+        """Covariance of all sources, without noise until it is `given`."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
@@ -165,8 +170,9 @@ class Posterior:
 
     @property
     def covariance(self) -> Tensor:
-        """Of the rows, noise included."""
-        assert self.conditioned
+        """Covariance of the rows, noise included."""
+        # The noise is added to the sums when they are first conditioned.
+        _ = self.conditioned
         return self.summed.matrix
 
     @property
@@ -175,7 +181,7 @@ class Posterior:
         return self.conditioned.nll
 
     def without(self, k: int) -> float:
-        """`nll` of the scene without source k, of circular gains."""
+        """Return `nll` of the scene without source k, of circular gains."""
         one, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
         one.add(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
@@ -198,21 +204,23 @@ class Posterior:
         return constant * self.dual_weights.sum(1) * self.scene.turns[:, None]
 
     def left_out(self) -> Tensor:
-        """Leave-one-receiver-out predictions (n, R) complex64.
+        """Return leave-one-receiver-out predictions (n, R) complex64.
 
         Rasmussen and Williams (2006), eq. 5.12, in blocks.
         """
         n = len(self.rows)
         order = torch.argsort(self.rows.receiver, stable=True)
         counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
+        # Both parts of a receiver's rows: either one alone would tell the other.
         groups = (torch.cat([group, group + n]) for group in order.split(counts.tolist()))
         error, _ = self.conditioned.left_out(groups)
         return self.rows.target - torch.complex(error[:n], error[n:])
 
 
 def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
-    """The scene with the phases of each source's mean gain under the circular process, and a noise floor."""
+    """Return the scene with phases of mean gains under the circular process, and a noise floor."""
     posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
+    # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
     one = rows.target.shape[1] == 1
     return replace(scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor)

@@ -100,13 +100,16 @@ class ImageSourceGP(SourcesInFrame):
         context = replace(context, budget_s=budget_s, effort=effort)
         budget, settings = context.time_budget(cache.spent), self.settings
         self.site, antennas = data.site, data.target.shape[1]
+        # The frame is of rows of all searches: their scenes are averaged in it.
         self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
         noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
+        # -50 dB of the rows' power: simulated channels may have no noise, and float32 needs some to factor.
         self.noise_floor = max(1e-5, noise / self.frame.scale**2)
         notes: list[str] = []
         self.factors = torch.ones(antennas, dtype=torch.complex64)
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
+            # Against the direct wave first, as a search needs aligned antennas; again against what it found.
             start = self._searched_rows(data, known, 0)
             data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
         if settings.offsets != "none":
@@ -117,6 +120,7 @@ class ImageSourceGP(SourcesInFrame):
         row_sets = self._row_sets(data, known)
         look = None
         if self._groups and context.race is not None:
+            # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = raced(context.race, group, partial(self._missed, data.batch(group)))
         members = self._search(row_sets, settings, budget, cache, look)
@@ -124,6 +128,7 @@ class ImageSourceGP(SourcesInFrame):
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known)
+                # Factors change little the second time: a refinement does, no other search.
                 members = [refined(row_sets[one.number], one) for one in members]
         rows = self._rows(data, known)
         self._become(rows, members)
@@ -177,6 +182,7 @@ class ImageSourceGP(SourcesInFrame):
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
         rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
+        # Search number n is the same however many there are: a resumed run may ask for more.
         settings = replace(self.settings, searches=1, seed=0)
         seed = str(self.settings.seed)
         return {"data": identity(data), "rows": rows, "seed": seed, "settings": str(settings)}
@@ -189,7 +195,9 @@ class ImageSourceGP(SourcesInFrame):
 
     def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
         """What a search's scene misses (n, ...) of a batch that it left out."""
+        # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
+        # Predictions are in stored units, the batch's targets already times the factors.
         return mean - batch.target / self.factors[:, None]
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
@@ -217,6 +225,7 @@ class ImageSourceGP(SourcesInFrame):
         rows, means = [], []
         for turn, group in enumerate(self._groups):
             if mine := [one for one in members if one.number % len(self._groups) == turn]:
+                # As many rows as the process that answers has: fewer would err more than it does.
                 apart = self._rows(data, self._kept(known, turn), most)
                 rows.append(group)
                 means.append(copy.copy(self)._become(apart, mine).predict(data.batch(group)).mean)
@@ -252,6 +261,7 @@ class ImageSourceGP(SourcesInFrame):
         turned = orientations(scene.planes, scene.sequences)
         away = ranges_at(places.flatten(0, 1), scene.sources, turned)
         waves = wave_over_band(away, torch.from_numpy(frequency))
+        # Antennas of known places share the gains; those of unknown ones each have their own.
         if gains.shape[1] == 1 or places.shape[1] > 1:
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
@@ -278,7 +288,7 @@ class ImageSourceGP(SourcesInFrame):
         return gain.movedim(0, -1), away, self.query.sources
 
     def left_out(self) -> LeftOutRows:
-        """Receivers, each predicted from all others."""
+        """Return receivers, each predicted from all others."""
         frame = self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
@@ -289,7 +299,7 @@ class ImageSourceGP(SourcesInFrame):
         return ("searches", "keep", "confidence")
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
+        """Return `contribution0`, `contribution1`, ... (K,): mean power of each search's sources at rows."""
         return {
             f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
             for i, member in enumerate(self.members)
@@ -335,10 +345,11 @@ class ImageSourceGP(SourcesInFrame):
         return ("phase", "visibility") if any(len(one.scene.clutter) for one in self.members) else ("phase",)
 
     def objects(self) -> SiteObjects:
-        """Planes and boxes of the heaviest search."""
+        """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
         planes = scene.planes.double()
         normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
         moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
         boxes = scene.clutter.boxes.double().view(-1, 2, 3) + middle
         return SiteObjects.of(moved.numpy(), boxes.numpy())
@@ -350,7 +361,7 @@ class ImageSourceGP(SourcesInFrame):
             self._conditioned(self._rows(data, rows), [member.scene for member in self.members])
 
     def size(self) -> int:
-        """Sources of the largest scene."""
+        """Return the number of sources of the largest scene."""
         return max((len(member.scene.sequences) for member in self.members), default=0)
 
 

@@ -24,7 +24,7 @@ class OffsetEstimate:
     delay: np.ndarray
 
     def removed(self, target: np.ndarray, frequency_hz: np.ndarray, carrier_hz: float) -> np.ndarray:
-        """Targets (S, A, K) without their offsets."""
+        """Return targets (S, A, K) without their offsets."""
         phasor = 2 * np.pi * (frequency_hz - carrier_hz) * self.delay[:, None] - self.phase[:, None]
         return (target * np.exp(1j * phasor)[:, None]).astype(target.dtype)
 
@@ -37,7 +37,7 @@ def estimate(
     timing: bool,
     mask: np.ndarray | None = None,
 ) -> OffsetEstimate:
-    """The offsets that maximise the correlation of snapshots with their predictions.
+    """Return the offsets that maximise the correlation of snapshots with their predictions.
 
     Args:
         target, predicted: (S, A, K) complex.
@@ -56,6 +56,7 @@ def estimate(
         correlation = np.abs(per_tone @ phasor)
         best = correlation.argmax(1)
         before, at, after = (correlation[np.arange(len(best)), (best + s) % DELAYS] for s in (-1, 0, 1))
+        # Negative at a maximum; a flat correlation has no top.
         curvature = np.minimum(before - 2 * at + after, -1e-30)
         delay = tried[best] + 0.5 * (before - after) / curvature * (period / DELAYS)
     phasor = np.exp(2j * np.pi * (frequency_hz - carrier_hz) * delay[:, None])

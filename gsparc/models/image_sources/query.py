@@ -68,17 +68,17 @@ class Means:
         self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
 
     def visible_share(self, queries: Tensor) -> Tensor | None:
-        """Visible share (K, m) of each source from queries (m, 3 or 6) [m]; None without clutter."""
+        """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
         if self.unfolding is None or self.obstacles is None:
             return None
         return self.obstacles.visible_share(self.unfolding.paths(queries[:, :3]))
 
     def ranges(self, queries: Tensor) -> Tensor:
-        """Ranges (m, K) float64 [m] of each source, or of its image of the antenna of queries (m, 6)."""
+        """Return ranges (m, K) float64 [m] of sources, or of their images of antennas of queries (m, 6)."""
         return ranges_at(queries, self.sources, self.orientations)
 
     def varying(self, queries: Tensor) -> Tensor:
-        """Correlations (K, m, n) of what varies of the gains, at queries (m, 3 or 6) [m] and the places.
+        """Return correlations (K, m, n) of varying gains at queries (m, 3 or 6) [m] and at the places.
 
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
         """
@@ -96,7 +96,7 @@ class Means:
         return in_double(self)
 
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance (m,), prior (m,).
+        """Return means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,).
 
         Variance and the power expected without any rows hold at the middle of the band; 0 and 1 where no
         variance is computed.
@@ -121,7 +121,7 @@ class Means:
         return means, *self.variance(arriving, varying[:first])
 
     def gains(self, queries: Tensor) -> Tensor:
-        """Complex gains (K, m, R) of the sources of all processes at queries."""
+        """Return complex gains (K, m, R) of the sources of all processes at queries."""
         return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -29,7 +29,7 @@ Cost = Callable[[list[Tensor]], Tensor]
 
 
 def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
-    """The best scene of `steps` steps of Adam (D. P. Kingma and J. Ba, ICLR 2015), or of those until `late`.
+    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `late`.
 
     Args:
         rows: measurements.
@@ -98,7 +98,7 @@ def _likelihood(
 
 
 def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
-    """Parameters of the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
+    """Fit the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.

@@ -76,7 +76,7 @@ def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_r
 
 
 def find_walls(sources: Tensor) -> Tensor | None:
-    """Walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
+    """Return walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
     count = len(sources)
     tolerance = WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02
     first, second = torch.triu_indices(count, count, 1)
@@ -101,7 +101,7 @@ def find_walls(sources: Tensor) -> Tensor | None:
 
 
 def orthogonal_walls(scene: Scene) -> Tensor | None:
-    """The fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
+    """Return the fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
 
     Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
     along one normal only gives a plane. None when no two planes are perpendicular. The sequences of the
@@ -159,7 +159,7 @@ def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
 
 
 def reassign(scene: Scene, walls: Tensor) -> Scene:
-    """New sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
+    """Return new sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
     tolerance = 2.5 * (WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02)
     base = replace(scene, planes=walls)

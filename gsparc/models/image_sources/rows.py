@@ -40,7 +40,7 @@ class Rows:
         return len(self.position)
 
     def take(self, index: Tensor) -> Rows:
-        """The rows with these numbers."""
+        """Return the rows with these numbers."""
         element = None if self.element is None else self.element[index]
         measured = (self.target[index], self.receiver[index])
         return Rows(self.position[index], self.frequency[index], *measured, self.array, element)
@@ -53,12 +53,12 @@ class Rows:
         return torch.cat([self.position, self.array[self.element]], 1)
 
     def static_ends(self, static: Tensor) -> Tensor:
-        """The static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
+        """Return the static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
         return static if self.array is None else static + self.array
 
 
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
-    """Antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
+    """Return antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
 
     By reciprocity the moving transmitter receives from each of them; those of unknown places are outputs.
     """
@@ -69,7 +69,7 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
 
 
 def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
-    """Places (S, E, 3) [m] of the antennas at positions (S, 3); E = 1 when the array's geometry is unknown.
+    """Return places (S, E, 3) [m] of antennas at positions (S, 3); E = 1 where the geometry is unknown.
 
     Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
     """
@@ -79,7 +79,7 @@ def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> T
 
 
 def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor) -> Tensor:
-    """Where each antenna's channel is measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m].
+    """Return where antennas' channels are measured (`Rows.places`): (S, E, 3) or (S, E, 6) float64 [m].
 
     Args:
         site: where.
@@ -91,11 +91,12 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
     if array is not None:
         moving = position[:, None].expand(-1, len(array), -1)
         return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
+    # Antennas of a static receiver without a known array are outputs at the transmitter's place.
     return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
 
 
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
-    """At most `limit` rows from the given measurements.
+    """Return at most `limit` rows from the given measurements.
 
     Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
     of these the same number of tones, a comb over the band with a random start, so that together they cover
@@ -115,6 +116,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
         index = index[np.sort(rng.permutation(len(index))[:limit])]
     places = measured_places(data, index).numpy()
     per = places.shape[1]
+    # Antennas first, tones from what is left of the limit.
     most = min(max(limit // max(len(index), 1), 1), per)
     wanted = min(max(limit // max(len(index) * most, 1), 1), tones)
     parts = []
@@ -122,11 +124,13 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
         values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
+            # Antennas of unknown places are outputs of one row, so that a tone must be measured at all.
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:
                 continue
             comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
+            # Of six numbers the last three are the static end's antenna, which `element` names.
             at, target = np.repeat(place[e, None, :3], count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T
             parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
@@ -136,13 +140,13 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
 
 
 def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
-    """`channel_places` of measurements (S,)."""
+    """Return `channel_places` of measurements (S,)."""
     position, rotation = (torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation))
     return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
 def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
-    """Ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
+    """Return ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
 
     Args:
         places: see `Rows.places`.
@@ -150,11 +154,12 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
         turned: (K, 3, 3), see `mirror_planes.orientations`.
     """
     if places.shape[1] > 3:
+        # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
     return ranges(places[:, :3], sources)
 
 
 def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
+    """Return the lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
     places = torch.cat([rows.position, transmitter[None]])
     return torch.stack([places.amin(0), places.amax(0)])

@@ -40,7 +40,7 @@ class KernelVisibility:
     length: float | Tensor = 2.0
 
     def correlation(self, places: Tensor, source: Tensor) -> Tensor:
-        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
+        """Return (n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
@@ -52,17 +52,18 @@ class KernelVisibility:
 
     @staticmethod
     def of(value: Tensor) -> KernelVisibility:
-        """From the logit of `constant` and the logarithms of both lengths; differentiable."""
+        """Make it from the logit of `constant` and the logarithms of both lengths; differentiable."""
         return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
 
     def parameters(self, least: float, *shares: float) -> Tensor:
-        """Inverse of `of`, then the logits of more `shares`; all shares are at least `least`."""
+        """Return what `of` reads, then the logits of more `shares`; all shares are at least `least`."""
+        # A logit has no value at 0 and 1, and hardly a slope near them.
         clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
         return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
 
     def plain(self) -> KernelVisibility:
-        """With numbers instead of tensors."""
+        """Return it with numbers instead of tensors."""
         return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
 
 
@@ -98,7 +99,7 @@ class Scene:
 
     @staticmethod
     def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
-        """The static end (3,) [m] alone, of log amplitude (1,)."""
+        """Return the static end (3,) [m] alone, of log amplitude (1,)."""
         return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
 
     @cached_property
@@ -123,50 +124,51 @@ class Scene:
         return torch.polar(torch.ones(()), self.phase)
 
     def visible_share(self, places: Tensor) -> Tensor:
-        """Share of each source that clutter lets through to places (n, 3) [m]: (n, K), or (1, 1)."""
+        """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3) [m]."""
         if not len(self.clutter):
             return torch.ones(1, 1)
         return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
 
     def scatterers(self, rows: Rows) -> Tensor:
-        """Which sources (K,) bool are scatterers; others are images.
+        """Return which sources (K,) bool are scatterers; others are images.
 
         A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands
         inside the box of receivers and transmitter, the transmitter itself apart, is a scatterer.
         """
         points, box = self.sources, box_of(rows, self.transmitter)
         inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
+        # Within 10 cm it is the transmitter itself.
         return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
 
     def images(self, rows: Rows) -> Tensor:
-        """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
+        """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
     def unobstructed(self, rows: Rows) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, turned by their phases, without clutter."""
+        """Return waves (n, K) complex64 of sources at every row, turned by phases, without clutter."""
         waves = steering(rows, self.images(rows))
         return waves if self.phase is None else waves * self.turns
 
     def waves(self, rows: Rows) -> Tensor:
-        """The same, attenuated by clutter."""
+        """Return the same, attenuated by clutter."""
         waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
         return waves if self.phase is None else waves * self.turns
 
     def longer(self, order: int) -> list[Reflections]:
-        """Other sequences over the planes: those of up to `order` with one more at the end, and all pairs."""
+        """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
         indices = range(len(self.planes))
         more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
         known = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
     def over(self, sequences: Iterable[Reflections]) -> Scene:
-        """Other sequences over the same planes, of gains that are not known."""
+        """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
     def with_sequences(
         self, sequences: list[Reflections], amplitude: Tensor, phase: Tensor | None = None
     ) -> Scene:
-        """More sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
+        """Return more sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
         if phase is not None and self.phase is not None:
             phase = torch.cat([self.phase, phase])
@@ -175,7 +177,7 @@ class Scene:
         )
 
     def only(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
-        """The sources of these indices, and the planes that they use, or that are named."""
+        """Return the sources of these indices, and the planes that they use, or that are named."""
         sequences = [self.sequences[i] for i in indices]
         used = sorted({index for sequence in sequences for index in sequence}.union(planes))
         new = {old: i for i, old in enumerate(used)}
@@ -190,7 +192,7 @@ class Scene:
 
 
 def steering(rows: Rows, sources: Tensor) -> Tensor:
-    """Spherical waves (n, K) complex64 of sources at every row.
+    """Return the spherical waves (n, K) complex64 of sources at every row.
 
     Args:
         rows: n of them.
@@ -207,18 +209,18 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
 
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
+    """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
     waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
 
 
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
-    """Visibility correlations (K, n, n) float32."""
+    """Return visibility correlations (K, n, n) float32."""
     return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
 def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
+    """Return unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
     offset = places - sources[..., None, :]
     return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
 
@@ -234,4 +236,5 @@ def _is_wide(places: Tensor, length: float) -> bool:
 
 def _squared(a: Tensor) -> Tensor:
     length = a.square().sum(-1)
+    # The sum cancels for near places, and rounds below 0.
     return (length[:, None] + length[None] - 2 * a @ a.T).clamp_min(0)

@@ -61,15 +61,18 @@ class SearchCache:
         self._path = None if folder is None or folder == Path() else folder / FILE
         self._depends_on = dict(depends_on or {})
         self._searches: dict[str, dict[str, Any]] = {}
+        # Searches end in several threads.
         self._lock = threading.Lock()
         self.spent = NOTHING
         self.limited_by: Clock | None = None
         if resume is not None:
             self._open(resume)
+        # After `_open`, which reads what the interrupted run had spent.
         self._watch = TimeBudget(before=self.spent)
 
     def _open(self, file: Path) -> None:
         try:
+            # With `weights_only` nothing that a checkpoint holds is executed.
             stored = torch.load(stored_archive(file), weights_only=True)
             before, wall = dict(stored["depends_on"]), float(stored["spent_s"])
             searches, spent = dict(stored[SEARCHES]), Spent(wall, float(stored["processor_s"]))
@@ -84,7 +87,7 @@ class SearchCache:
         log.info("reusing %d cached searches (%.0f s of training time)", len(searches), wall)
 
     def find(self, number: int) -> Member | None:
-        """The finished search of this number, or None."""
+        """Return the finished search of this number, or None."""
         with self._lock:
             search = self._searches.get(f"search {number}")
         return None if search is None else made(Member, search)

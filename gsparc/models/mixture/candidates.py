@@ -27,13 +27,13 @@ Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
 
 
 def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Image sources of several searches, and a process on what they leave."""
+    """Return image sources of several searches, and a process on what they leave."""
     method = ImageSourceGP(**_searched(init, clutter, context))
     return Residual(method) if residual else method
 
 
 def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Images of the static end in the walls of `init.file`.
+    """Return images of the static end in the walls of `init.file`.
 
     Raises:
         DataError: no such file, or walls that cannot be.
@@ -43,7 +43,7 @@ def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext
 
 
 def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Coherent waves, or what the path loses in walls of a file (`init=scene`), and a process of the rest.
+    """Make coherent waves, or losses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
         DataError: `init=scene` without a file, or walls that cannot be.
@@ -53,12 +53,12 @@ def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContex
 
 
 def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Powers of several stations in one process; without `clutter` they share their law alone."""
+    """Return powers of several stations in one process; without `clutter` they share their law alone."""
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
 def bearings(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Sources where bearings cross, of at most `init.searches` searches."""
+    """Return sources where bearings cross, of at most `init.searches` searches."""
     search = replace(SearchSettings(), sources=init.max_sources)
     searches = max(round(init.searches * context.effort), 1)
     return MovingArrayField(search=search, seed=context.seed, searches=searches)
@@ -70,6 +70,7 @@ def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[st
     own = {name: getattr(init, name) for name in names}
     own["searches"] = max(round(context.effort * init.searches), 1)
     for name in ("search_rows", "rows"):
+        # Factoring a covariance of n rows takes n^3.
         own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
     return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 

@@ -64,6 +64,7 @@ def fit_all(
     several = cut is not None
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
     groups = () if cut is None else _groups(cut, fold.train)
+    # Searches come last: they race against the best before them, and end where they fall behind.
     plans = [(part, init) for part in parts if part not in OPEN_ENDED]
     for part in (part for part in parts if part in OPEN_ENDED):
         if several and part in SEARCHES:
@@ -81,12 +82,14 @@ def fit_all(
     for name, settings in plans:
         part = name.split()[-1]
         if part in SEARCHES:
+            # A resumed run reads finished searches back, however few seconds are left.
             spent = fields and context.resume is None and budget.over()
             if why := "the seconds were over" if spent else ended.get(part) or _reached(race):
                 log.info("init=%s is left out: %s", name, why)
                 continue
         within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
         if name.startswith("few "):
+            # Its settings are others: its searches must not stand in the file of the plan that follows.
             within = replace(within, run_dir=Path(), resume=None)
         try:
             leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
@@ -100,9 +103,7 @@ def fit_all(
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = comparable(data.batch(field.held.rows).target, data.site)
-                one = Race.of(
-                    field.held.rows, comparable(field.held.mean, data.site), target, note, context.effort
-                )
+                one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
                 if race is None or part not in SEARCHES:
                     note(name, float(one.squared.mean()))
                 else:
@@ -113,11 +114,13 @@ def fit_all(
                 raise
             raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
         except ValueError as error:
+            # A `ValueError` too; searches of the same part that follow would fall behind alike.
             if isinstance(error, Behind):
                 ended[part], reports[name] = str(error), FitReport(budget.counted.wall - began)
             elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
+            # It is there where the fit went well and rows held out did not.
             fields.pop(name, None)
             continue
         reports[name] = report
@@ -134,7 +137,7 @@ def _reached(race: Race | None) -> str | None:
 def weigh_candidates(
     solutions: dict[str, ClosedForm], data: Measurements, fold: Fold, cut: InnerFolds | None
 ) -> dict[str, tuple[ClosedForm, float]]:
-    """Solutions with their weights where positive, by rows which they were not conditioned on.
+    """Return solutions with their weights where positive, by rows which they were not conditioned on.
 
     Those are validation rows, and training rows as `cut`; one solution needs neither.
     """
@@ -146,6 +149,7 @@ def weigh_candidates(
     left_out = [field.held for field in solutions.values() if field.held is not None]
     rows = np.zeros(0, np.int64)
     if len(left_out) == len(solutions):
+        # Only rows that every solution was without can be compared.
         rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in left_out]), np.int64)
     batch = data.batch(fold.val)
     predicted = []
@@ -190,6 +194,7 @@ def _held(
         field.condition(data, np.setdiff1d(rows, group))
         batch = data.batch(group)
         answers.append(field.predict(batch))
+    # Back to all rows, of which the last group is still missing.
     field.condition(data, rows)
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
@@ -198,7 +203,7 @@ def _held(
 def weigh_process(
     field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
 ) -> tuple[tuple[GaussianProcess, float] | None, float | None]:
-    """What a plain process on whole targets is worth next to a field, on rows that neither learned from.
+    """Return what a plain process on whole targets is worth beside a field, by rows neither learned from.
 
     Those are validation rows and, of spectra, training rows that both predict without their neighbours:
     a dozen rows alone decide by chance.

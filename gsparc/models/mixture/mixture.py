@@ -74,11 +74,11 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
 
     @abstractmethod
     def tries(self, data: Measurements) -> Mapping[str, Candidate]:
-        """Candidates by name, weighed where they are several."""
+        """Return candidates by name, weighed where they are several."""
 
     @abstractmethod
     def obstacle(self, data: Measurements) -> str | None:
-        """Why this cannot be solved for such measurements; None where it can."""
+        """Return why this cannot be solved for such measurements; None where it can."""
 
     @property
     def plain(self) -> bool:
@@ -99,11 +99,13 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
                 raise ValueError(f"{self.name}: {why}")
             parts = self.tries(data)
             named = self.init.name in ("auto", "diffuse", *parts)
+            # An initialiser of another kind of site means nothing here: what this kind has is tried.
             name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
             init = replace(self.init, name=name)
         heeded.count(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
+        # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = site.kind != "spectrum" and site.static_end is not None and phases
         known = np.concatenate([fold.train, fold.val])
@@ -117,6 +119,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
     ) -> FitReport:  # fmt: skip
         """First where rows were measured, then where they rather were."""
         budget = context.time_budget()
+        # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
         rows, by, note = refined(self, self.runs.aligned(data), std)
@@ -181,6 +184,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         if several:
             context.curve(seconds, "final")
         stages = {name: report.seconds for name, report in reports.items()}
+        # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages["final weights"] = seconds - self.init_s
         unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
@@ -201,7 +205,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return explained(own, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Every member on the same rows."""
+        """Condition every member on the same rows."""
         for member in self.members:
             member.condition(data, rows)
 
@@ -209,6 +213,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
         if self.only is None or not self.only.forgets:
             return None
+        # Deep, as members are conditioned in place and those of this method must stay as they are.
         result = copy.deepcopy(self)
         result.condition(data, rows)
         return result
@@ -232,6 +237,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         spreads, shares = [], []
         for weight, one in pairs:
             assert one.variance is not None and one.unknown is not None
+            # Of a mixture: the mean of variances plus the variance of means (law of total variance).
             apart = (one.mean - mean).abs().square().flatten(1).mean(1)
             spreads.append(weight * (one.variance + apart))
             shares.append(weight * one.unknown)
@@ -240,7 +246,7 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
     def left_out(self) -> LeftOutRows:
-        """The mean of all."""
+        """Return the mean of all."""
         result = [member.left_out() for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
@@ -305,11 +311,11 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
 
     def size(self) -> int:
-        """Gaussians of all members."""
+        """Return the number of Gaussians of all members."""
         return sum(member.count for member in self.members)
 
     def objects(self) -> SiteObjects:
-        """Those of the heaviest member that found any."""
+        """Return those of the heaviest member that found any."""
         result = [self.members[i].objects() for i in np.argsort(self.weights)[::-1]]
         return next((one for one in result if len(one)), result[0])
 
@@ -341,6 +347,7 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
     if not RunFactors.several(data, known):
         return RunFactors.none()
     waves = ChannelField()
+    # Validation rows too: candidates are weighed by them in the phase of the same run.
     waves.fit(data, Fold(known, known[:0], known[:0]), context)
     log.info("channels of %d runs: the factor of each was estimated with the waves' field", len(waves.runs))
     return waves.runs

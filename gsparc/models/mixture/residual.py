@@ -55,11 +55,13 @@ class Residual(ReducedByPart, ClosedForm):
         if budget.over():
             note = "no time for a process on what the sources leave"
             return replace(report, notes=(*report.notes, note), limited_by=budget.clock)
+        # Direct wave and leakage are for the method: in what it leaves they would be fitted to its errors.
         process = ChannelField(ChannelSettings(direct=False, constant=False))
         fold = Fold(left.rows, left.rows[:0], left.rows[:0])
         within = process.fit(_residuals(left, data), fold, replace(context, budget_s=budget.left_s))
         missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
         predicted = process.left_out().mean.flatten()
+        # Least squares share of left-out predictions: below 1 where the process is too sure.
         overlap = float((predicted.conj() * missed).real.sum())
         self.share = min(max(overlap / max(float(predicted.abs().square().sum()), 1e-30), 0.0), 1.0)
         gain = float((missed - self.share * predicted).abs().square().sum() / missed.abs().square().sum())
@@ -74,6 +76,7 @@ class Residual(ReducedByPart, ClosedForm):
         self.method.condition(data, rows)
         if self.rest is not None:
             left = self.method.left_out()
+            # Residuals of rows left out: of rows that the method knows they would be too small.
             self.rest.condition(_residuals(left, data), left.rows)
 
     def predict(self, query: Query) -> Prediction:
@@ -100,11 +103,11 @@ class Residual(ReducedByPart, ClosedForm):
         return self.method.terms if self.rest is None else (*self.method.terms, "residual")
 
     def size(self) -> int:
-        """The method's."""
+        """Return the method's."""
         return self.method.size()
 
     def objects(self) -> SiteObjects:
-        """The method's."""
+        """Return the method's."""
         return self.method.objects()
 
     @property

@@ -29,7 +29,7 @@ LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
 def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[float, ...]:
-    """Weights in [0, 1] of sum one: of one alone, unless a mixture is surely better; see `choose_weights`.
+    """Return weights in [0, 1] of sum one: one alone, unless a mixture is surely better.
 
     Args:
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
@@ -55,13 +55,13 @@ class Rows:
     target: np.ndarray
 
     def log_errors(self, weight: float) -> np.ndarray:
-        """Logarithm (n,) of the mean squared error of each row, the second weighed by `weight`."""
+        """Return the log (n,) of each row's mean squared error, the second weighed by `weight`."""
         mixed = (1 - weight) * self.own + weight * self.plain
         return np.log(((mixed - self.target) ** 2).mean(1) + LEAST_ERROR)
 
 
 def share_of_second(parts: Sequence[Rows]) -> float:
-    """Weight in [0, 1] of the second of two predictors with which the mean PSNR over all rows is largest.
+    """Return the weight in [0, 1] of the second of two predictors that makes the mean PSNR of rows largest.
 
     0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
     second alone is better than the first: a query may take longer rather than lose to it. Few rows that
@@ -79,20 +79,20 @@ def share_of_second(parts: Sequence[Rows]) -> float:
 
 
 def error(predicted: Tensor, target: Tensor) -> float:
-    """Share of the target's energy that is missed."""
+    """Return the share of the target's energy that is missed."""
     missed = (predicted - target).abs().square().sum()
     return float(missed / target.abs().square().sum().clamp_min(1e-30))
 
 
 def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
-    """Share of the variance that a prediction explains, of complex targets about zero; at most 1."""
+    """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
     middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
     whole = (target - middle).abs().square().sum().clamp_min(1e-30)
     return 1 - float((predicted - target).abs().square().sum() / whole)
 
 
 def comparable(values: Tensor, site: Site) -> Tensor:
-    """Values in the unit that errors are counted in: powers in decibels."""
+    """Return values in the unit that errors are counted in: powers in decibels."""
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
 
 
@@ -104,13 +104,13 @@ def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
 
 
 def real(values: Tensor) -> Tensor:
-    """Entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
+    """Return entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
     return values.double().flatten(1)
 
 
 def best_weights(gram: np.ndarray) -> np.ndarray:
-    """Weights (K,), none negative, summing to one, of the smallest w^T `gram` w; gram is (K, K).
+    """Return weights (K,), none negative, summing to one, of the smallest w^T `gram` w; gram is (K, K).
 
     Scaled to any sum s, the smallest s^2 w^T G w + (s - 1)^2 belongs to the same w: plain non-negative least
     squares.
@@ -137,7 +137,7 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
 
 
 def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Weights (K,) of the predictions: one alone, unless a mixture is better by more than a standard error.
+    """Return weights (K,) of predictions: one alone, unless a mixture is better by over a standard error.
 
     The mixture is judged on units whose rows its weights were not learned from.
 
@@ -160,7 +160,7 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
 
 
 def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """Squared errors (n,) of a mixture (K,) from products (n, K, K)."""
+    """Return the squared errors (n,) of a mixture (K,) from products (n, K, K)."""
     return np.einsum("k,nkl,l->n", weights, gram, weights)
 
 

@@ -29,7 +29,7 @@ RIDGES = np.logspace(-2, 4, 13)  # chosen by leave-one-out
 
 
 def image_features(image: Tensor, added: Tensor) -> Tensor:
-    """Features (n, 3) of predicted images: logarithms of brightness and of what is added, largest pixel.
+    """Return features (n, 3) of predicted images: log brightness, log of what is added, largest pixel.
 
     Args:
         image: (n, H, W), the prediction.
@@ -73,7 +73,7 @@ class ErrorRegression(WithKernel):
     prior: float
 
     def expected(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-        """What is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
+        """Return what is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
 
         An image is known to its relative error with weight c and not at all with weight 1 - c, the
         correlation c of a source's power over what the nearest row is farther than the largest gap of rows.
@@ -89,7 +89,7 @@ class ErrorRegression(WithKernel):
         return 1 - known / (1 + error), variance
 
     def relative_error(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m] to the nearest; see `expected`.
+        """Return the expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m]; see `expected`.
 
         Beyond the largest distance between training places it grows with the distance squared.
         """
@@ -106,7 +106,7 @@ class ErrorRegression(WithKernel):
 def fit_errors(
     places: np.ndarray, relative_error: Tensor, features: Tensor, kernel: Kernel, reach: float, prior: float
 ) -> ErrorRegression:
-    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
+    """Fit leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
 
     `kernel`, `reach` and `prior` are `ErrorRegression`'s.
     """

@@ -66,7 +66,7 @@ class Spectra:
         return torch.from_numpy(self.places).float()
 
     def at(self, rows: np.ndarray) -> Spectra:
-        """Some of them."""
+        """Return some of them."""
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
@@ -121,6 +121,7 @@ class MovingArrayField(Differentiable, ClosedForm):
             raise ValueError(f"{self.name}: {problem}")
         self._budget, self._lags = context.time_budget(), None
         report = super().fit(data, fold, context)
+        # The rows of `super().fit` in its order: `left_out` names its images by them.
         self.rows = heard(data, np.concatenate([fold.train, fold.val]))
         return replace(report, limited_by=self._budget.limited_by)
 
@@ -135,7 +136,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("searches", *own) if len(self.trends) > 1 else own
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Nothing: the process itself holds what each component contributes."""
+        """Return nothing: the process itself holds what each component contributes."""
         return {}
 
     reduced = reduced
@@ -144,6 +145,7 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         budget, watch = self._budget, TimeBudget()
+        # Before any lags are taken: they are linear in power, not in amplitude.
         self.exponent = self._exponent(targets)
         self.basis = separable(self._blocks(targets), UNRESOLVED)
         spectra = self._spectra(positions, targets)
@@ -154,6 +156,7 @@ class MovingArrayField(Differentiable, ClosedForm):
             power = self._powers(spectra, sources)
             modelled += self._add(spectra, sources, power, self._choose_kernel(spectra, sources, power))
             rows = _spread(len(positions), self.trend.rows)
+            # What the mean of the searches so far would miss, were this the last.
             left = spectra.values[rows] - modelled[rows] / len(self.trends)
             errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
             log.info(
@@ -165,6 +168,7 @@ class MovingArrayField(Differentiable, ClosedForm):
                 break
         modelled /= len(self.trends)
         rows = _spread(len(positions), self.rest_rows)
+        # After the last search: the residual is of the mean of all, not of any one.
         kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])[1]
         self._complete(spectra, modelled, kernel, targets)
         note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, leave-one-out error "
@@ -174,11 +178,12 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Powers, trends, residual and errors anew, with the sources and kernels of the fit."""
+        """Solve powers, trends, residual and errors anew, with the sources and kernels of the fit."""
         self.rows = rows = heard(data, rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
+        # Trends are emptied, as `_add` appends those of the new rows.
         spectra, before, self.trends = self._spectra(data.moving[rows], targets), self.trends, []
         modelled = torch.zeros_like(spectra.values)
         for one in before:
@@ -239,6 +244,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _choose_kernel(self, spectra: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
         """Kernel of a trend, by leave-one-out error."""
         rows = _spread(len(spectra.places), self.trend.rows)
+        # Lengths are shares of the site's diagonal, of 1 m where all rows are at one place.
         some, diagonal = spectra.at(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
@@ -257,6 +263,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         relative, features, errors = [], [], []
         for start, image in zip(range(0, len(targets), BLOCK), self._blocks(targets), strict=True):
             part = slice(start, start + BLOCK)
+            # Clamped as answers are: the error model is of what is answered.
             images = self.basis.images(self._left[part]).clamp_(0, 1)
             error = (images - image).square().mean((1, 2))
             relative.append(error / image.square().mean((1, 2)).clamp_min(1e-12))
@@ -285,6 +292,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         if dtype == torch.float64:
             query, errors = query.exact, in_double(errors)
         answer = query(queries)
+        # Stored pixels lie in [0, 1]; sources and residual need not add up to such.
         mean = answer.image.clamp_(0, 1)
         features = image_features(mean, answer.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
@@ -292,27 +300,27 @@ class MovingArrayField(Differentiable, ClosedForm):
         return Prediction(mean, variance, unknown, answer.explained.clamp(0, 1))
 
     def query(self) -> Images:
-        """Answers with all that was found, made once."""
+        """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
             self._query = Images(self.array(), self.basis, self.trends, self.residual, places)
         return self._query
 
     def size(self) -> int:
-        """Number of sources of all searches."""
+        """Return the number of sources of all searches."""
         return sum(len(trend.sources) for trend in self.trends)
 
     def array(self, stride: int = 1) -> Array:
-        """That looks, at every `stride`-th pixel."""
+        """Return the array, which looks at every `stride`-th pixel."""
         return Array(self.lags(), self.rotation(), self.exponent, stride)
 
     def rotation(self) -> Tensor:
-        """(3, 3) of the array, receiver to world."""
+        """Return the rotation (3, 3) of the array, receiver to world."""
         assert self.site is not None and self.site.rx_rotation is not None
         return torch.from_numpy(np.asarray(self.site.rx_rotation)).float()
 
     def lags(self) -> Lags:
-        """The array's, computed once."""
+        """Return the array's lags, computed once."""
         assert self.site is not None
         if self._lags is None:
             self._lags = Lags(*self.site.array_geometry())

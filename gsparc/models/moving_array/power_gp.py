@@ -38,12 +38,12 @@ class WithKernel:
     kernel: Kernel
 
     def state(self) -> dict[str, Any]:
-        """Plain tensors and numbers."""
+        """Return plain tensors and numbers."""
         return {**vars(self), "kernel": self.kernel.state()}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
-        """Inverse of `state`."""
+        """Make what had this `state`."""
         return cls(**{**state, "kernel": Kernel.read(state["kernel"])})
 
 
@@ -64,12 +64,12 @@ class Trend(WithKernel):
     weights: Tensor
 
     def powers(self, far: Tensor) -> Tensor:
-        """Power (m, K) of every source at places that are `far` (m, n) [m] from the training receivers."""
+        """Return powers (m, K) of sources at places that are `far` (m, n) [m] from training receivers."""
         return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
 
 
 def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and their left-out residuals (n, K)."""
+    """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
     posterior = Exact.of(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, left_out(posterior.factor.precision, posterior.weights)[0]
 
@@ -77,7 +77,7 @@ def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, 
 def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
 ) -> tuple[Trend, np.ndarray]:
-    """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
+    """Return the trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
     weights, residual = solved(kernel, places, torch.from_numpy(power - level))
     # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more

@@ -46,11 +46,11 @@ class Array:
         self._pixels = space.pixels if stride == 1 else space.pixels.thinned(stride)
 
     def atoms(self, sources: Tensor, receivers: Tensor) -> Tensor:
-        """Lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
+        """Return lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
         return self.space.atoms(bearings(sources, receivers, self.rotation))
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
-        """Images (n, H, W) of sources of powers (n, K)."""
+        """Return images (n, H, W) of sources of powers (n, K)."""
         images = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
         if self.exponent == 1 or not followed(images):
             return images if self.exponent == 1 else images.sqrt()
@@ -89,6 +89,7 @@ class Images:
         self, array: Array, basis: Separable, trends: Sequence[Trend], residual: Residual, places: Tensor
     ) -> None:
         self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
+        # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
 
@@ -99,6 +100,7 @@ class Images:
         images = [self._array.render(t.sources, receivers, t.powers(far)) for t in self._trends]
         explained = images[0] if len(images) == 1 else torch.stack(images).mean(0)
         added = self._residual.coefficients(far)
+        # In place into fresh images: another copy would be as large as the answer.
         return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
 
     @cached_property
@@ -108,7 +110,7 @@ class Images:
 
 
 def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The mean of the first `searches` with the strongest components of the residual (`keep`, a share).
+    """Return the mean of the first `searches` with the strongest components of the residual (`keep`).
 
     On fewer pixels (`stride`) and without its variance.
 
@@ -152,5 +154,5 @@ class ReducedMean(View):
         return Prediction(self._query(query.places(self.inner.site)).image.clamp_(0, 1))
 
     def size(self) -> int:
-        """Components kept."""
+        """Return the number of components kept."""
         return self._count

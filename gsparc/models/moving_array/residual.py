@@ -38,16 +38,16 @@ class Residual(WithKernel):
     weights: Tensor
 
     def coefficients(self, far: Tensor) -> Tensor:
-        """Of images (m, R) at places that are `far` (m, n) [m] from the training receivers."""
+        """Return coefficients (m, R) of images at places `far` (m, n) [m] from the training receivers."""
         return torch.addmm(self.mean, self.kernel.correlation(far) @ self.weights, self.axes)
 
     def first(self, count: int) -> Residual:
-        """With the `count` axes that most is predicted along."""
+        """Return the process with the `count` axes that most is predicted along."""
         return Residual(self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous())
 
 
 def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int) -> tuple[Residual, Tensor]:
-    """The process on coefficients (n, R) at places (n, 3) [m], and its left-out predictions (n, R).
+    """Return the process on coefficients (n, R) at places (n, 3) [m], and its left-out predictions (n, R).
 
     Axes are those of the left-out predictions, fewer than those of the rows: a row's own details are on the
     latter, but in no prediction. What a prediction lacks of its axes adds about its energy to the error.
@@ -68,7 +68,7 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
 
 
 def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
-    """Leave-one-out square error of images (n, R) under the kernel of largest likelihood, and that kernel."""
+    """Return the left-out squared error of images (n, R) under the likeliest kernel, and that kernel."""
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
     scores = centred @ principal(centred, KERNEL_COMPONENTS)[1].T
@@ -79,7 +79,7 @@ def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
 
 
 def principal(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """The at most `limit` principal axes (C, R) of values (n, R), and the energy (C,) along each, falling."""
+    """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them, falling."""
     n, r = values.shape
     gram = values @ values.T if n <= r else values.T @ values
     keep = min(limit, n, r)

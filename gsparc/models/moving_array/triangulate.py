@@ -49,14 +49,14 @@ class SearchSettings:
 
 
 def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:
-    """Unit vectors (n, K, 3) from receivers (n, 3) to sources (K, 3) [m], receiver frame."""
+    """Return unit vectors (n, K, 3) from receivers (n, 3) to sources (K, 3) [m], receiver frame."""
     way = sources[None] - receivers[:, None]
     return (way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)) @ rotation
 
 
 @torch.no_grad()
 def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
-    """Power (n, K), none negative, of each source at each receiver.
+    """Return the power (n, K), none negative, of each source at each receiver.
 
     Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate descent from
     the clipped free solution (Franc, Hlavac and Navara 2005).
@@ -71,12 +71,13 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
         for k in range(power.shape[1]):
             step = (power[:, k] - slope[:, k] / curvature[:, k]).clamp_(min=0) - power[:, k]
             power[:, k] += step
+            # One column instead of a product with the whole Gram matrix a step.
             slope += step[:, None] * gram[:, k]
     return power
 
 
 def mixture(power: Tensor, atoms: Tensor) -> Tensor:
-    """Lags (n, Q) of sources of the given power (n, K)."""
+    """Return lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
 
@@ -84,7 +85,7 @@ def find_sources(
     lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
     settings: SearchSettings, seed: int, over: Callable[[], bool],
 ) -> Tensor:  # fmt: skip
-    """Positions (K, 3) float32 [m] of sources.
+    """Return positions (K, 3) float32 [m] of sources.
 
     Args:
         lags: (n, Q) of the spectra.
@@ -112,6 +113,7 @@ def find_sources(
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
+        # Of powers the receiver nearest to a source would decide the sum alone.
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
@@ -131,8 +133,10 @@ def find_sources(
             break
         progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
+        # As many receivers a step on every site, so that its time is bounded.
         some = torch.randperm(len(receivers), generator=generator)[:64]
         residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))
+        # A share of the energy: levels of spectra must not matter beside Adam's epsilon.
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()
@@ -149,6 +153,7 @@ def _best(
     for image, receiver in zip(images, receivers, strict=True):
         pixel, inside = _pixels(bearings(candidates, receiver[None], rotation)[0], grid)
         score += torch.where(inside, image[pixel], 0.0)
+    # The best eighth: doubles are found by comparing pairs one by one.
     ranked = candidates[score.argsort(descending=True)[:1500]]
     some = receivers[:: max(1, len(receivers) // 12)][:12]
     seen = bearings(ranked, some, rotation).transpose(0, 1).reshape(len(ranked), -1)
@@ -163,10 +168,12 @@ def _best(
 
 def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
     """Nearest pixel (n,) of unit vectors (n, 3), and whether the grid has one there."""
+    # Unit vectors rounded above 1 have no arcsine.
     elevation = torch.asin(directions[:, 2].clamp(-1, 1))
     azimuth = torch.atan2(directions[:, 1], directions[:, 0])
     row = ((elevation - grid.first_elevation) / grid.elevation_step).round().long()
     column = ((azimuth - grid.first_azimuth) / grid.azimuth_step).round().long()
+    # On the full circle, of which the grid may have a part: columns beyond its width are outside.
     column = column % round(2 * np.pi / grid.azimuth_step)
     inside = (row >= 0) & (row < grid.height) & (column < grid.width)
     return (row.clamp(0, grid.height - 1) * grid.width + column.clamp(0, grid.width - 1)), inside
@@ -187,7 +194,7 @@ def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
 
 
 def site_problem(data: Measurements) -> str | None:
-    """Why sources cannot be triangulated from these measurements; None when they can."""
+    """Return why sources cannot be triangulated from these measurements; None when they can."""
     otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
     problem = no_array(data.site, "tx", otherwise)
     if problem is not None:

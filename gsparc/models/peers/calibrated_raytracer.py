@@ -69,10 +69,11 @@ class CalibratedRayTracer(Method):
             raise ValueError("model: steps is at least 0, samples and batch at least 1")
         self._scene_json, self._silent_db, self._factor = "", 0.0, 1.0 + 0.0j
         self._tracer: RayTracer | None = None
+        # A depth that no tracer takes is refused here, before anything is loaded.
         self._traced_effects()
 
     def problem(self, data: Measurements) -> str | None:
-        """Why it cannot serve these measurements; None where it may."""
+        """Return why it cannot serve these measurements; None where it may."""
         site = data.site
         if site.kind not in self.kinds:
             return f"{self.name}: needs received powers or channels, not {site.kind}"
@@ -102,19 +103,24 @@ class CalibratedRayTracer(Method):
             raise ValueError(f"{self.name}: {error}") from error
         self._scene_json, self._tracer = json.dumps(asdict(scene)), None
         rows = heard(data, np.concatenate([fold.train, fold.val]))
+        # Measurements are local, the tracer's scene is in world coordinates.
         places, measured = data.moving[rows] + data.site.origin, _levels(data, rows)
         tracer = self._ready()
         own = used_materials(tracer)
         start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
+        # Before the replay, whose first powers are those under the start's materials.
         apply(tracer, start)
+        # Paths are traced once: materials change what they carry, not where they run.
         replay = Replay(tracer, places, self._traced_effects())
         traced = replay.powers()
         reached = traced > 0
+        # Gain and scale of the residuals are learned at least: two unknowns.
         if reached.sum() < 2:
             raise ValueError(f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?")
         self.learned = calibrate(replay, start, traced, measured, self.steps)
         # Without paths in training, what is weakest there is the best guess of what lies deeper.
         self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
+        # Powers tell a gain in decibels; channels need its phase too.
         if data.site.kind == "csi":
             self._factor = self._best_factor(data, rows)
         return FitReport(begin.spent, self._notes(len(rows) - int(reached.sum())))
@@ -148,6 +154,7 @@ class CalibratedRayTracer(Method):
         if self.site.kind == "csi":
             return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
         power = paths.received_power()
+        # No path is -inf dB, which the silent level replaces.
         with np.errstate(divide="ignore"):
             level = np.where(power > 0, 10 * np.log10(power) + self.learned.gain_db, self._silent_db)
         return Prediction(torch.from_numpy(10 ** (level / 10))[:, None].float())
@@ -163,6 +170,7 @@ class CalibratedRayTracer(Method):
         return self._ready().trace(places + self.site.origin, self._traced_effects())
 
     def _traced_effects(self) -> PropagationEffects:
+        # Diffuse scattering has parameters of its own, which nothing here learns.
         return PropagationEffects(
             diffraction=self.diffraction, edge_diffraction=False, diffuse=False, polarisation=False,
             depth=self.depth,
@@ -180,7 +188,7 @@ class CalibratedRayTracer(Method):
         return self._tracer
 
     def state(self) -> dict[str, Any]:
-        """The scene's settings, the materials, the gain."""
+        """Return the scene's settings, the materials, the gain."""
         assert self.learned is not None
         return {
             "scene": self._scene_json, "learned": asdict(self.learned), "silent_db": self._silent_db,
@@ -202,5 +210,6 @@ def _levels(data: Measurements, rows: np.ndarray) -> np.ndarray:
         return to_real(data.target[rows], "rssi")[:, 0].astype(np.float64)
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     squared = np.abs(data.target[rows].astype(np.complex128)) ** 2
+    # A row without any measured tone has power 0, not 0 / 0.
     power = (squared * measured[rows]).sum(axis=(1, 2)) / np.maximum(measured[rows].sum(axis=(1, 2)), 1)
     return to_real(power, "rssi")[:, 0].astype(np.float64)

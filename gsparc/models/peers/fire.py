@@ -28,13 +28,15 @@ class Network(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, hidden: int, code: int) -> None:
         super().__init__()
+        # Of every number of the code a mean and the logarithm of its variance.
         self.encoder = perceptron(2 * inputs, 2 * code, hidden, 2, nn.GELU)
         self.decoder = perceptron(code, 2 * outputs, hidden, 2, nn.GELU)
 
     def forward(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Downlink (B, K) and the code's divergence from a standard normal (B,)."""
+        """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
+        # KL divergence of N(m, s^2) from N(0, 1) (Kingma and Welling 2014, appendix B).
         divergence = 0.5 * (middle.square() + log_variance.exp() - 1 - log_variance).sum(1)
         out = self.decoder(code)
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
@@ -71,10 +73,12 @@ class Fire(UplinkMethod):
         self.site = self._need_uplink(data)
         rows = data.batch(np.concatenate([fold.train, fold.val]))
         assert rows.uplink is not None
+        # Both bands lose alike along the path: the uplink's level carries over to the downlink.
         scale = rms(rows.uplink)[:, None, None]
         x = (self.own(rows.uplink) / scale).flatten(0, 1)
         y = (rows.target / scale).flatten(0, 1)
         generator = torch.Generator().manual_seed(self.seed)
+        # Layers draw from torch's global generator, which the caller finds as it was.
         with torch.random.fork_rng():
             torch.manual_seed(self.seed)
             self._sizes = [x.shape[1], y.shape[1], self.hidden, self.code]

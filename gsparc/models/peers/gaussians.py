@@ -59,16 +59,16 @@ class GaussianNetwork(Network):
     field: GaussianField
 
     def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
-        """What each Gaussian emits (N,) for one position (1, 3)."""
+        """Return what each Gaussian emits (N,) for one position (1, 3)."""
         raise NotImplementedError
 
     def cloud(self, strengths: Tensor) -> GaussianCloud:
-        """The Gaussians, with what each emits (N,)."""
+        """Return the Gaussians, with what each emits (N,)."""
         return self.field.cloud(strengths, "emission of a Gaussian")
 
 
 def gaussians_of(scene: Scene, count: int) -> GaussianField:
-    """All around a static receiver between 1 and 6 m; for a moving one uniform in its box and 2 m around."""
+    """Draw all around a static receiver between 1 and 6 m; of a moving one in its box and 2 m around."""
     static = scene.receiver
     place, turn = (None, None) if static is None else (static.position, static.rotation)
     init: Literal["uniform", "sphere"] = "uniform" if static is None else "sphere"
@@ -77,7 +77,7 @@ def gaussians_of(scene: Scene, count: int) -> GaussianField:
 
 
 def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
-    """Grid and cut-off: spectra bring their grid; channels see the full sphere, with relative cut-offs."""
+    """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(1e-3, relative=True)}
 
@@ -89,7 +89,7 @@ def render_each(
     grid: SphereGrid,
     **options: Any,
 ) -> Tensor:
-    """Images of samples with different Gaussians each, one plan per sample.
+    """Return images of samples with different Gaussians each, one plan per sample.
 
     Args:
         geometry: means (B, N, 3), quaternions (B, N, 4), scales (B, N, 3), opacities (B, N).
@@ -129,6 +129,6 @@ class Deformation(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, places: Tensor, queries: Tensor) -> Tensor:
-        """places (N, 3) [m], queries (B, 3) [m] -> (B, N, outputs)."""
+        """Return changes (B, N, outputs) of places (N, 3) [m] by queries (B, 3) [m]."""
         hidden = self.by_place(self.place(places)) + self.by_query(self.query(queries)).unsqueeze(1)
         return self.rest(torch.relu(hidden))

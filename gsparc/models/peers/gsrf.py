@@ -50,6 +50,7 @@ class ComplexGaussians(GaussianNetwork):
         self.grid, self.options = rendering_of(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
         with torch.no_grad():
+            # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
         self.response: nn.Parameter | None = None
         if scene.site.kind == "csi":  # of each Gaussian at every antenna and tone
@@ -59,8 +60,9 @@ class ComplexGaussians(GaussianNetwork):
         self._frozen: FrozenPlan | None = None
 
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Radiance (B, N, 2) of each Gaussian towards the moving end."""
+        """Return radiance (B, N, 2) of each Gaussian towards the moving end."""
         towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
+        # [m]: 1 / distance grows without end at the moving end itself.
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
         series = fourier_legendre(towards / distance, self.degree, self.order)
         sent = torch.einsum("bnk,nkc->bnc", series, self.coefficients)
@@ -72,7 +74,7 @@ class ComplexGaussians(GaussianNetwork):
         return torch.view_as_real(torch.view_as_complex(sent.contiguous()) * turns.squeeze(-1))
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W) or channels (B, A, K)."""
+        """Return spectra (B, H, W) or channels (B, A, K)."""
         sent, geometry = self.radiance(tx, rx), self.field.geometry()
         if self.response is not None:
             seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
@@ -86,23 +88,24 @@ class ComplexGaussians(GaussianNetwork):
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
+        """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
         plain = task_loss(seen, batch, self).mean()
+        # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
         difference = torch.fft.rfft2(seen - batch.target, norm="ortho").abs().mean()
         return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:
-        """Further training drops the frozen view."""
+        """Drop the frozen view, which further training makes stale."""
         self._frozen = None
         super().train(mode)
         return self
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
-        """A static receiver's view is frozen once."""
+        """Render spectra or channels; a static receiver's view is frozen once."""
         if self.response is not None or rx.batched or self.training:
             return self(tx, rx)
         if self._frozen is None:
@@ -141,12 +144,12 @@ def _magnitude(image: Tensor) -> Tensor:
 
 
 def terms(degree: int, order: int) -> int:
-    """Number of terms of `fourier_legendre`."""
+    """Return the number of terms of `fourier_legendre`."""
     return (degree + 1) * (2 * order + 1)
 
 
 def fourier_legendre(directions: Tensor, degree: int, order: int) -> Tensor:
-    """P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
+    """Return P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
 
     With complex coefficients these span the same functions as P_l(cos theta) exp(j m phi), |m| <= `order`,
     l <= `degree`; theta is measured from z.

@@ -58,7 +58,7 @@ class MarchedField(Network):
         self.register_buffer("directions", scene.site.grid.directions(torch.float32).reshape(-1, 3))
 
     def march(self, origin: Tensor, heading: Tensor, query: Tensor) -> Tensor:
-        """Magnitude (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
+        """Return magnitudes (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
         step = self.far / self.samples
         depth = step * torch.arange(self.samples)
         places = origin[:, None] + depth[:, None] * heading[:, None]
@@ -85,7 +85,7 @@ class MarchedField(Network):
         return error.mean()
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W), every ray of them."""
+        """Return spectra (B, H, W), every ray of them."""
         moving, pixels = self.scene.site.moving(tx, rx), torch.arange(len(self.directions))
         parts = []
         for sample, some in product(range(len(tx)), pixels.split(max(POINTS // self.samples, 1))):

@@ -59,7 +59,7 @@ class NeWRF(TrainedPeer):
     neighbours: int = 6
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Virtual transmitters, and which of them every training receiver sees.
+        """Return virtual transmitters, and which of them every training receiver sees.
 
         Raises:
             ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
@@ -101,7 +101,7 @@ class DirectedRays(Network):
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
     def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
-        """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).
+        """Return virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and which are (B, P).
 
         At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
         they were measured to see.
@@ -113,7 +113,7 @@ class DirectedRays(Network):
         return self.precomputed["virtual"][best.indices], best.values >= 0.5
 
     def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
-        """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""
+        """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m], those likely (B, P)."""
         towards = goals - places[:, None]
         apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
         heading = towards / apart
@@ -137,7 +137,7 @@ class DirectedRays(Network):
         return ((gain * wave).sum(-1) * likely).sum(-1)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Channels (B, 1, 1) at searched directions."""
+        """Return channels (B, 1, 1) at searched directions."""
         places = rx.position.reshape(-1, 3)
         return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
 
@@ -149,7 +149,7 @@ class DirectedRays(Network):
 
 
 def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Points where rays of several receivers meet, and which of them every receiver sees.
+    """Return points where rays of several receivers meet, and which of them every receiver sees.
 
     Args:
         places: (n, 3) [m].
@@ -202,6 +202,6 @@ def _merged(points: np.ndarray) -> np.ndarray:
 
 
 def votes(seen: list[np.ndarray], count: int) -> Tensor:
-    """How many rays of each receiver point at each virtual transmitter: (n, V) float32."""
+    """Return how many rays of each receiver point at each virtual transmitter: (n, V) float32."""
     table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
     return torch.from_numpy(table.astype(np.float32))

@@ -91,7 +91,7 @@ class Radiators(Network):
         self.register_buffer("wavenumbers", (2 * math.pi / LIGHT * hertz).float())  # type: ignore
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Channels (B, A, K) or spectra (B, H, W)."""
+        """Return channels (B, A, K) or spectra (B, H, W)."""
         moving = self.scene.site.moving(tx, rx)
         offset = moving[:, None] - self.means
         distance = (offset.square().sum(-1) + (2 * self.log_extents).exp()).sqrt()

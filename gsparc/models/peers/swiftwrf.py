@@ -58,11 +58,12 @@ class PlanarGaussians(GaussianNetwork):
         self.deformation = Deformation(sphere, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W)."""
+        """Return spectra (B, H, W)."""
         move, stretch, turn, light = self._changes(tx, rx)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
+        # A factor of 20 either way: exp of what a network says has no bound.
         widths = (self.log_widths + stretch.clamp(-3, 3)).exp()
         flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
@@ -70,6 +71,7 @@ class PlanarGaussians(GaussianNetwork):
         quats = turned_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
+        # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
         here = Pose(torch.zeros(3), torch.eye(3))
         image = render_each(geometry, strength, here, self.grid, cutoff=CUTOFF, compensate=False)
@@ -83,7 +85,7 @@ class PlanarGaussians(GaussianNetwork):
         return self.strengths + self._changes(tx, rx)[-1][0, :, 0]
 
     def cloud(self, strengths: Tensor) -> GaussianCloud:
-        """A metre from the receiver, before they are moved; opacities are strengths, as nothing is occluded.
+        """Return them a metre from the receiver, not yet moved; opacities are strengths: nothing is hidden.
 
         Raises:
             ValueError: the receiver moves: they are directions, and lie nowhere.
@@ -119,12 +121,14 @@ class SwiftWRF(DeformedPeer):
 
 
 def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
-    """`count` even directions (N, 3) over the grid's part of the sphere, and their tangents (N, 2, 3)."""
+    """Return `count` even directions (N, 3) over the grid's part of a sphere, and tangents (N, 2, 3)."""
     low = grid.first_elevation - grid.elevation_step / 2
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
     step = torch.arange(count) + 0.5
     bottom, top = math.sin(max(low, -math.pi / 2)), math.sin(min(high, math.pi / 2))
+    # Equal steps of z cut the sphere into equal areas.
     z = bottom + (top - bottom) * step / count
+    # Turns by the golden ratio: a Fibonacci lattice, even at any count.
     turns = torch.remainder(step * (math.sqrt(5) - 1) / 2, 1.0)
     azimuth = grid.first_azimuth + turns * grid.width * grid.azimuth_step
     horizontal = (1 - z**2).clamp_min(0).sqrt()
@@ -134,13 +138,13 @@ def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
 
 
 def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
-    """Rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3) and the normal (N, 3)."""
+    """Return rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3) and the normal (N, 3)."""
     columns = torch.cat([axes, normal.unsqueeze(1)], 1).mT
     return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
 
 
 def turned_about_normal(frame: Tensor, half: Tensor) -> Tensor:
-    """Frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
+    """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()
     return torch.cat([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], -1)

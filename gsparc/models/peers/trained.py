@@ -80,19 +80,19 @@ class Network(nn.Module):
         self.scene, self.count = scene, count
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Training loss () of a batch; `draw` for whatever is drawn at random."""
+        """Return the training loss () of a batch; `draw` for whatever is drawn at random."""
         return task_loss(self(batch.tx, batch.rx), batch, self).mean()
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The prediction at inference, which may keep state between calls."""
+        """Return the prediction at inference, which may keep state between calls."""
         return self(tx, rx)
 
 
 def perceptron(
     inner: int, outer: int, width: int, depth: int, activation: type[nn.Module] = nn.ReLU
 ) -> nn.Sequential:
-    """`depth` hidden layers of `width`."""
+    """Return `depth` hidden layers of `width`."""
     sizes = [inner, *[width] * depth]
     layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), activation())]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
@@ -136,12 +136,12 @@ class TrainedPeer(Method):
             )
 
     def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """The untrained network of a scene; `precomputed` is what was computed before training."""
+        """Return the untrained network of a scene; `precomputed` is what was computed before training."""
         network: Network = self.makes(scene, self)
         return network
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Tensors computed from the training rows (n,) before training; stored with the weights."""
+        """Return tensors computed from the training rows (n,) before training; stored with the weights."""
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -178,7 +178,7 @@ class TrainedPeer(Method):
         return FitReport(budget.counted.wall, (note,), limited_by)
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
-        """What Lightning trains, with a schedule of `steps`."""
+        """Return what Lightning trains, with a schedule of `steps`."""
         network, warmup = self.fitted(), max(round(WARMUP * steps), 1)
         rates = OptimizerSettings(decay=FINAL_RATE, warmup=warmup)
         return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_of)
@@ -188,13 +188,13 @@ class TrainedPeer(Method):
         return kind, self.rates.get(kind, self.rate)
 
     def fitted(self) -> Network:
-        """The network; `ValueError` before `fit` or `restore`."""
+        """Return the network; `ValueError` before `fit` or `restore`."""
         if self.network is None:
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.network
 
     def size(self) -> int:
-        """Number of Gaussians or virtual transmitters; 0 for a network without, and before `fit`."""
+        """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""
         return 0 if self.network is None else self.network.count
 
     def gradient_problem(self) -> str | None:
@@ -209,7 +209,7 @@ class TrainedPeer(Method):
         return Prediction(mean if mean.is_complex() else mean.clamp(0, 1))
 
     def state(self) -> dict[str, Any]:
-        """Weights, and what the network is built from."""
+        """Return weights, and what the network is built from."""
         network = self.fitted()
         scene = {"shape": list(network.scene.shape), "box": network.scene.box, "found": self.precomputed}
         return {**scene, "network": network.state_dict(), "steps": self.steps}

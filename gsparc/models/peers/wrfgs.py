@@ -45,7 +45,7 @@ class DeformedGaussians(GaussianNetwork):
         self.deformation = Deformation(places, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Spectra (B, H, W)."""
+        """Return spectra (B, H, W)."""
         field = self.field
         place, turn, stretch, fade, light = self._changes(tx, rx)
         geometry = (

@@ -69,7 +69,7 @@ class PowerField(ClosedForm):
 
     @classmethod
     def of(cls, site: Site, prior: Prior) -> PowerField:
-        """One of known settings, to be conditioned."""
+        """Return one of known settings, to be conditioned."""
         result = cls()
         result.site, result.priors = site, ((1.0, prior),)
         return result
@@ -102,7 +102,9 @@ class PowerField(ClosedForm):
             return (note, *notes, *best.notes)
         found, said = candidates(seen, site, self.seed, chosen_on, more), list[str]()
         self.priors = ((1.0, found[0].prior),)
+        # A level that silent rows are below is no power that waves could be fitted to.
         if self.waves and not seen.silent.any() and sampled(seen.places, site.wavelength):
+            # `Fringes.rows` is searched by bisection, and must ascend.
             order = np.argsort(rows)
             assert site.wavelength is not None
             self.fringes, note = find_fringes(
@@ -149,6 +151,7 @@ class PowerField(ClosedForm):
         seen = rows_of(data, rows)
         own, *others = ((share, conditioned(seen, prior, self.seed)[0]) for share, prior in self.priors)
         self.powers = replace(own[1], others=tuple(others))
+        # The tree is of the rows before.
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels

@@ -26,12 +26,12 @@ from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 from gsparc.training.time_budget import TimeBudget
 
-FOLDS = 5
+FOLDS = 5  # of squares; each solution is blind to one
 SIDES = 8  # squares along the longer side
 BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
-MOST_ROWS = 3_000
+MOST_ROWS = 3_000  # of one least-squares problem per solution
 ROWS_PER_WAVE = 6  # two real unknowns each
 BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
 
@@ -51,8 +51,9 @@ class Blend:
     left: tuple[float, float]
 
     def at(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
-        """Shares (n,) of the solutions, and factors (n,) of the process's variance."""
+        """Return shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
+        # Linear between the two distances that were measured, constant beyond either.
         there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
         inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
@@ -89,13 +90,13 @@ class Fringes:
         return torch.from_numpy(self.basis.mixture @ self.weights)
 
     def solutions(self, places: Tensor) -> Tensor:
-        """Powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
+        """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
         return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
 
     def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """A process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
+        """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
 
         Args:
             decibels: (n,) of the process.
@@ -107,7 +108,7 @@ class Fringes:
     def blended_unseen(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
-        """The same at rows (n,) by those solutions that never saw them or their surroundings."""
+        """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
         mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
@@ -118,7 +119,7 @@ class Fringes:
         return decibels + share * (mean - decibels), factor
 
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that `fringes_of` needs."""
+        """Return tensors and numbers that `fringes_of` needs."""
         arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
         arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
         blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
@@ -127,7 +128,7 @@ class Fringes:
 
 
 def fringes_of(state: dict[str, Any]) -> Fringes:
-    """The fringes whose `state()` this was."""
+    """Return the fringes whose `state()` this was."""
     waves, mixture, weights, blind, rows, fold = (
         state[name].numpy() for name in ("waves", "mixture", "weights", "blind", "rows", "fold")
     )
@@ -154,7 +155,7 @@ def sampled(places: np.ndarray, wavelength: float | None) -> bool:
 
 
 def nearest(places: np.ndarray) -> np.ndarray:
-    """Distances (n,) of places (n, 3) from the nearest other [m]."""
+    """Return distances (n,) of places (n, 3) from the nearest other [m]."""
     return cKDTree(places).query(places, k=2)[0][:, 1]
 
 
@@ -166,7 +167,7 @@ def find_fringes(
     seed: int,
     budget: TimeBudget | None,
 ) -> tuple[Fringes | None, str]:
-    """Fringes where they pay beside a process, and what must be said of them.
+    """Return fringes where they pay beside a process, and what must be said of them.
 
     Args:
         rows: all heard.
@@ -195,6 +196,7 @@ def find_fringes(
     fringes: Fringes | None = None
     gain: Gain | None = None
     while len(weights) < budget.effort.fringes and not budget.over():
+        # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))
@@ -226,6 +228,7 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     number, every = counts.sum(1), len(blind)
     mean = (powers * counts).sum(1) / number
     spread = ((powers - mean[:, None]) ** 2 * counts).sum(1) / np.maximum(number - 1, 1)
+    # Errors of solutions are independent: the mean of m has variance s^2 / m.
     return spread * (1 / number - 1 / every)
 
 
@@ -235,6 +238,7 @@ def _apart(rows: Rows, fold: np.ndarray, process: PowerProcess) -> tuple[np.ndar
     assert isinstance(exact, Exact)
     inverse, weights = exact.factor.inverse, exact.weights[:, :1]
     probes, distance = fold < 0, np.zeros(len(fold))
+    # `left_out` is measured less predicted, errors here are predicted less measured.
     error = np.where(probes, -left_out(inverse, weights)[0][:, 0].numpy(), 0.0)
     distance[probes] = nearest(rows.places)[probes]
     for k in range(FOLDS):
@@ -250,11 +254,13 @@ def _blend(
 ) -> tuple[Blend, Gain]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
+    # From the process's prediction, measured plus error, to that of the solutions.
     towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
     excess = _excess_variance(powers, fold, blind)
     shares, left = [], []
     for chosen in (probes, ~probes):
         share = _share(error[chosen], towards[chosen], excess[chosen], group[chosen])
+        # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
         left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
@@ -266,13 +272,14 @@ def _blend(
 
 
 def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np.ndarray) -> float:
-    """Of what leads from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
+    """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
     Rows of one group err together and count as one.
     """
     alike = len(group) / len(np.unique(group))
     noise = alike * max(float((error**2).mean()), 1e-12)
     square = max(float(towards @ towards - excess.sum()), 0.0)
+    # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
     certain = 1 / SPREAD**2
     return float(
         np.clip((-(towards @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)

@@ -31,7 +31,7 @@ class Gain:
 
 
 def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
-    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
+    """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
 
     Along the longer side of the places' box there are `sides` squares.
     """
@@ -43,14 +43,14 @@ def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
 
 def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """`count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
+    """Return `count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
     names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
     parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
     return [part for part in parts if len(part)]
 
 
 def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
-    """What `one` gains, by squared errors (n,) [dB^2] of both at rows left out, and the rows' groups (n,)."""
+    """Return what `one` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
     gain = other - one
     total = np.bincount(group, gain - gain.mean())
     return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))

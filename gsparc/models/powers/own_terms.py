@@ -46,6 +46,7 @@ class InWorld(Columns):
 
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`; of places in local coordinates."""
+        # Places are of one end (n, 3), or of both (n, 6).
         return self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
 
     def state(self) -> dict[str, Any]:

@@ -58,7 +58,7 @@ AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more on
 def fit_powers(
     rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
 ) -> tuple[PowerProcess, tuple[str, ...]]:
-    """A process of largest leave-one-out likelihood, and what must be said of it.
+    """Return a process of largest leave-one-out likelihood, and what must be said of it.
 
     Where some rows were silent, settings are those of largest evidence as expectation propagation has it.
 
@@ -105,7 +105,7 @@ class Candidate:
 def candidates(
     rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
 ) -> list[Candidate]:
-    """Of each mean law the likeliest settings, the best first, then those of kriging.
+    """Return the likeliest settings of each mean law, the best first, then those of kriging.
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """
@@ -128,7 +128,7 @@ def _kriged(rows: Rows, trend: Trend) -> Candidate:
 def mixture(
     rows: Rows, found: list[Candidate], seed: int, chosen_on: int
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
-    """Candidates with their shares in a mean, the largest first, and what must be said of them.
+    """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
     Shares of two have the least squared error at squares of floor left out, with a prior on equal ones.
     """
@@ -171,7 +171,7 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
 def chosen_among(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
-    """The best of mean laws (each with its cost and notes), with its kernel."""
+    """Return the best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
     if not many:

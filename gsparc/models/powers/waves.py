@@ -42,16 +42,16 @@ class Basis:
     mixture: np.ndarray
 
     def plane(self, places: np.ndarray) -> np.ndarray:
-        """The plane waves (n, M) at places (n, 3) [m]."""
+        """Return the plane waves (n, M) at places (n, 3) [m]."""
         return np.exp(1j * (places @ self.waves.T))
 
     def columns(self, places: np.ndarray) -> np.ndarray:
-        """(n, r) complex128 at places (n, 3) [m]."""
+        """Return (n, r) complex128 at places (n, 3) [m]."""
         return self.plane(places) @ self.mixture
 
 
 def basis_of(places: np.ndarray, wavelength: float) -> Basis:
-    """Combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
+    """Return combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
 
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
     """
@@ -63,12 +63,12 @@ def basis_of(places: np.ndarray, wavelength: float) -> Basis:
 
 
 def decibels_of(field: np.ndarray) -> np.ndarray:
-    """Powers [dB] of complex fields of any shape, with the floor."""
+    """Return powers [dB] of complex fields of any shape, with the floor."""
     return 10 * np.log10(np.abs(field) ** 2 + FLOOR)
 
 
 def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
+    """Return complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
 
     A weight's prior is complex normal of variance 1.
     """

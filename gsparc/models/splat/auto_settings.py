@@ -37,7 +37,7 @@ class Choices:
 
 
 def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
-    """Choices for a site, and one line for each that was `auto`: "init=auto -> uniform: the receiver moves".
+    """Return choices for a site, and lines on those left `auto`: "init=auto -> uniform: the receiver moves".
 
     A closed-form start needs spectra, a static receiver, a linear read-out and kernel features. Hidden units
     need an encoding of few values, because each Gaussian has a network of its own.
@@ -68,6 +68,7 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
         array = "with" if start == "vectors" else "without"
         raise ValueError(f"init={start} needs {needed}, {array} effects.array; here {why}")
     started = start in ("images", "vectors")
+    # Channels are signed, powers have no ceiling, pixels lie in [0, 1]; solved weights are linear.
     fitting = {"csi": "linear", "rssi": "softplus", "spectrum": "linear" if started else "sigmoid"}
     reason = "a closed-form start" if started else f"the target is {site.kind}"
     if through_array:
@@ -81,13 +82,14 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
         bias = 0.0
         if site.kind == "rssi" and activation == "softplus":
             count = max(settings.field.count, 1)
+            # Inverse of softplus, at 1 / count.
             bias = math.log(math.expm1(1 / count))
             notes.append(f"init_bias=auto -> {bias:.2f}: {count} Gaussians add up to unit power")
     return Choices(start, encoding, activation, float(bias)), tuple(notes)
 
 
 def settled(settings: ModelSettings, choices: Choices) -> ModelSettings:
-    """The settings with nothing left at `auto`."""
+    """Return the settings with nothing left at `auto`."""
     replace = dataclasses.replace
     encoding = replace(settings.emission.encoding, kind=choices.encoding)
     emission = replace(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def interrupted(path: Path) -> checkpoint.Stored:
-    """What an interrupted training left.
+    """Return what an interrupted training left.
 
     Raises:
         ValueError: when the file holds a finished model without a trainer's state, or one that is not finite.
@@ -55,7 +55,7 @@ class GsparcCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """The trainer's part of a checkpoint.
+        """Return the trainer's part of a checkpoint.
 
         Raises:
             ValueError: when the file holds a finished model without a trainer's state.

@@ -42,7 +42,7 @@ LEAST_NOISE = 1e-6  # of the kernel's variance
 
 
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
-    """Smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
+    """Return smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
     chosen, kernel = _kernel(data, rows, anchors, seed)
     return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
 
@@ -61,7 +61,7 @@ class Process:
 
 
 def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
-    """Of training rows (n,), at up to `anchors` places."""
+    """Learn a process of training rows (n,), at up to `anchors` places."""
     _, kernel = _kernel(data, rows, anchors, seed)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
@@ -96,12 +96,12 @@ class Seen:
     attenuation: Tensor | None
 
     def at(self, rows: np.ndarray) -> Seen:
-        """Of some rows (m,) alone."""
+        """Return the process of some rows (m,) alone."""
         attenuation = None if self.attenuation is None else self.attenuation[rows]
         return Seen(self.weights, self.images[rows], self.outputs[rows], attenuation)
 
     def rendered(self, outputs: Tensor) -> Tensor:
-        """Images (n, P) of other outputs (n, N) at the same places."""
+        """Return images (n, P) of other outputs (n, N) at the same places."""
         emission = outputs.float()
         return (emission if self.attenuation is None else emission * self.attenuation) @ self.weights.mT
 
@@ -194,7 +194,7 @@ def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> 
 
 
 def prepare(task: InitTask) -> Start:
-    """The start of a task.
+    """Return the start of a task.
 
     Raises:
         ValueError: a start is asked for that the data do not allow.

@@ -66,6 +66,7 @@ class ImageProcess(LearnedField):
             why = no_array(data.site, "rx", "the receiver moves") if self.settings.response.array else None
             if why is not None:
                 raise ValueError(f"{self.name}: {why}")
+            # Without Gaussians no step changes anything.
             if not self.settings.field.count:
                 self.most_steps = 0
             choices, _ = resolve(self.settings, self.init.name, data.site)
@@ -74,6 +75,7 @@ class ImageProcess(LearnedField):
                 GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
                 ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
             )  # fmt: skip
+        # Settings of the field count as heeded only where the field has a part in the answer.
         with heeded.apart() as read:
             report = super().fit(data, fold, context)
         if not self._alone:
@@ -82,11 +84,13 @@ class ImageProcess(LearnedField):
         if self._average is not None:
             method = self._average[0]
             known = np.sort(np.concatenate([fold.train, fold.val]))
+            # It was weighed without validation rows, and answers with them.
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
         log.info("%s: %s", self.name, self.made)
+        # Steps that no look kept, or all of the field: paid for, and not in the answer.
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
@@ -119,6 +123,7 @@ class ImageProcess(LearnedField):
         if self._average_mean is None:
             self._average_mean = mean_alone(self._average[0])
         method, weight = self._average
+        # The process without its variance is float32 and has no slopes, which float64 is asked for.
         exact = query.tx.dtype == torch.float64
         other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
         assert self.site is not None
@@ -141,7 +146,7 @@ class ImageProcess(LearnedField):
         return averaged(result, process, partial(mixed, weight=weight, site=self.site))
 
     def size(self) -> int:
-        """Number of Gaussians."""
+        """Return the number of Gaussians."""
         return 0 if self._alone else super().size()
 
     @property
@@ -165,7 +170,7 @@ class ImageProcess(LearnedField):
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Field, averaged process, and what was found out."""
+        """Return the field, averaged process, and what was found out."""
         beside = None
         if self._average is not None:
             method, weight = self._average

@@ -292,7 +292,7 @@ class LearnedField(Method):
         """A hook between the stages: what a process averaged with the field would gain."""
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> GaussianModule:
-        """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
+        """Return what Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
         solved = self.choices is not None and self.choices.closed_form
         rates = self.rates.after_closed_form(steps) if solved else self.rates
         return GaussianModule(self.fitted(), self.loss, rates, steps, run_dir)
@@ -343,7 +343,7 @@ class LearnedField(Method):
     # -- answering ---------------------------------------------------------------------------------
 
     def fitted(self) -> GaussianModel:
-        """The trained model.
+        """Return the trained model.
 
         Raises:
             ValueError: before `fit` or `restore`.
@@ -368,7 +368,7 @@ class LearnedField(Method):
             return self._answered(self.fitted(), self.frozen_at(rx), tx, rx)
 
     def gradient_problem(self) -> str | None:
-        """Where the receiver moves: its footprints have none."""
+        """Return a reason where the receiver moves: footprints that move have no gradient."""
         if self.site is not None and self.site.moving_end == "rx":
             return "footprints of Gaussians have none by the receiver's position"
         return None
@@ -397,7 +397,7 @@ class LearnedField(Method):
         return Prediction(mean, unknown=1 - model.confidence.normalised(model.site.moving(tx, rx)))
 
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
-        """The matrix of the static receiver, made anew after an edit; None for any other pose."""
+        """Return the matrix of the static receiver, made anew after an edit; None for any other pose."""
         model, static = self.fitted(), self._receiver()
         if model.site.kind != "spectrum" or static is None or rx.batched:
             return None
@@ -429,7 +429,7 @@ class LearnedField(Method):
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """Everything `restore` needs."""
+        """Return everything `restore` needs."""
         prior = None if self._prior is None else vars(self._prior)
         choices = None if self.choices is None else vars(self.choices)
         model = self.fitted().state_dict()
@@ -452,7 +452,7 @@ class LearnedField(Method):
         self.frozen = self._doubled = None
 
     def size(self) -> int:
-        """Number of Gaussians."""
+        """Return the number of Gaussians."""
         return len(self.fitted().gaussians)
 
     @property

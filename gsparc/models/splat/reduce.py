@@ -49,7 +49,7 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
 
 @torch.no_grad()
 def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """`contribution` (N,): what each Gaussian adds to the predictions at training rows (n,), on average.
+    """Return `contribution` (N,): what each Gaussian adds to predictions at training rows (n,) on average.
 
     Its weight summed over the directions of the receiver times the size of its emission. `receiver` (4, 3) is
     the pose of a static one, its position [m] above its rotation.
@@ -74,7 +74,7 @@ def _weights(model: GaussianModel, rx: Pose) -> Tensor:
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The field with what `settings` spare left out; the trained one stays as it is.
+    """Return the field with what `settings` spare left out; the trained one stays as it is.
 
     Args:
         method: fitted.
@@ -141,7 +141,7 @@ def _keep(model: GaussianModel, rows: Tensor) -> None:
 
 
 def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
-    """Rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
+    """Return rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
 
     Each is the one farthest from all before it. What is kept is taught anew, so places count, not strengths:
     an eighth of 2,000 Gaussians chosen by contribution leaves holes.
@@ -150,6 +150,7 @@ def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
     order = [int(measured["contribution"].argmax())]
     apart = 1 - seen @ seen[order[0]]
     while len(order) < len(seen):
+        # Below every distance, so that what is chosen is not chosen again.
         apart[order[-1]] = -1.0
         order.append(int(apart.argmax()))
         apart = torch.minimum(apart, 1 - seen @ seen[order[-1]])
@@ -166,7 +167,7 @@ def _linear(model: GaussianModel) -> bool:
 
 @torch.no_grad()
 def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
-    """The emissions with which `few` come nearest to the images of the whole field, at all positions at once.
+    """Set emissions of `few` that come nearest to images of the whole field, at all positions at once.
 
     Images are W E f(x) with weights W (pixels x Gaussians), read-outs E and features f: least squares over
     the pixels gives E of the few from W E of all.
@@ -174,6 +175,7 @@ def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
     rx, grid = Pose(receiver[0], receiver[1:]), whole.site.grid
     assert grid is not None
     entries = grid.height * grid.width * len(whole.gaussians)
+    # The finest grid whose pixels times Gaussians fit in memory.
     fitting = [s for s in (1, 2, 3, 4, 5) if grid.width % s == 0 and entries <= MOST_WEIGHTS * s**2]
     grid = coarser(grid, fitting[0]) if fitting else grid
     wanted = _weights_of(whole, rx, grid)

@@ -18,16 +18,16 @@ class SeparatesPaths(Protocol):
     """Finds the propagation paths of an uplink."""
 
     def sources(self, uplink: Tensor) -> Any:
-        """Gains, delays and directions (B, N) of uplinks (B, U, L)."""
+        """Return gains, delays and directions (B, N) of uplinks (B, U, L)."""
 
     def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
-        """Channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
+        """Return channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
 
 def rms(channels: Tensor) -> Tensor:
-    """Root mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
+    """Return the root mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
     return channels.abs().square().mean((1, 2)).sqrt().clamp_min(1e-30)
 
 
@@ -54,7 +54,7 @@ class UplinkMethod(Method):
         return "predictions follow from an uplink, not from a position"
 
     def own(self, uplink: Tensor) -> Tensor:
-        """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""
+        """Return those of uplinks (B, U, L) that are heard by the antennas that answer, (B, A, L)."""
         assert self.site is not None
         return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
 

@@ -105,7 +105,7 @@ class UplinkField(UplinkMethod):
 
     # ---- predicting ----
     def sources(self, uplink: Tensor, noise: Tensor | None = None) -> Sources:
-        """The sources of snapshots (B, U, L): directions, delays, gains."""
+        """Return the sources of snapshots (B, U, L): directions, delays, gains."""
         return self._search(uplink, noise).sources
 
     def predict(self, query: Query) -> Prediction:
@@ -115,7 +115,7 @@ class UplinkField(UplinkMethod):
     def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
-        """The same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
+        """Return the same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
         tones = ((frequency_hz.double() - self._middle_hz) / self._spacing_hz).float()
         return self._predict_at(uplink, noise, Aperture(self._downlink.places[antennas], tones))
 
@@ -172,7 +172,7 @@ class UplinkField(UplinkMethod):
         self.error_model = None if state["trust"] is None else RelativeErrorRegression(**state["trust"])
 
     def size(self) -> int:
-        """Sources of a snapshot."""
+        """Return the number of sources of a snapshot."""
         return self.settings.rounds * self.settings.picks
 
 

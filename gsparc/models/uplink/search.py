@@ -44,22 +44,22 @@ class Sources:
 
     @property
     def variance(self) -> Tensor:
-        """Of the gains (B, N), given directions and delays."""
+        """Variance of the gains (B, N), given directions and delays."""
         return torch.diagonal(self.gain_covariance, dim1=1, dim2=2).real.clamp_min(0)
 
     @property
     def delay_variance(self) -> Tensor:
-        """Of the delays (B, N), turns^2 per tone^2."""
+        """Variance of the delays (B, N), turns^2 per tone^2."""
         variance = torch.diagonal(self.position_covariance, dim1=1, dim2=2)
         return variance[:, -self.delay.shape[1] :].clamp_min(0)
 
     def response(self, aperture: Aperture) -> Tensor:
-        """Channels (B, A, K) complex64."""
+        """Return channels (B, A, K) complex64."""
         over_antennas, over_tones = steering(self.direction, aperture), delays(self.delay, aperture)
         return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
 
     def error_variance(self, aperture: Aperture) -> Tensor:
-        """Expected squared error per entry (B,) of `response`, to first order in the places."""
+        """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
         count = self.gain.shape[1]
         gram = Columns.of(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
@@ -122,6 +122,7 @@ class SourceSearch:
         for turn in range(s.rounds):
             new_direction, new_delay = self._peaks(residual)
             direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
+            # Unit power in equal shares of all sources that there will be.
             prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
             last = turn == s.rounds - 1
             inflated_noise = noise + UNEXPLAINED * residual.abs().square().mean((1, 2))
@@ -129,9 +130,11 @@ class SourceSearch:
                 fit = self._fit(y, inflated_noise, direction, delay, prior)
                 turned, moved = self._step(fit, inflated_noise)
                 direction, delay = direction + turned, delay + moved
+                # Tipping's update: a gain that noise explains shrinks its own prior, and with it its source.
                 prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
             if not last:
                 residual = y - fit.columns.response(fit.gain)
+        # What was not found yet counted as noise above; the posterior is of the known noise.
         fit = self._fit(y, noise, direction, delay, prior)
         residual = scale[:, None, None] * (y - fit.columns.response(fit.gain))
         return self._posterior(fit, noise, direction, delay, scale), residual
@@ -155,6 +158,7 @@ class SourceSearch:
         gains = gain.repeat(1, 3)
         slope = ((inner[:, n:] - (cross @ gain[..., None])[..., 0]) * gains.conj()).real
         gain_slopes = cross @ inverse
+        # Variable projection: what other gains can make up for tells nothing of places.
         projected = gram[:, n:, n:] - gain_slopes @ cross.mH
         curvature = (projected * gains[:, None] * gains.conj()[..., None]).real
         return _Fit(columns, gain, inverse, slope, curvature, gain_slopes)
@@ -217,7 +221,7 @@ class _Fit:
     gain_slopes: Tensor
 
     def variance(self, noise: Tensor) -> Tensor:
-        """Of the gains (B, N)."""
+        """Return the variance of the gains (B, N)."""
         return noise[:, None] * torch.diagonal(self.inverse, dim1=1, dim2=2).real
 
 
@@ -239,6 +243,7 @@ def _grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[
     axes = []
     for axis in range(2):
         extent = float(aperture.places[:, axis].max() - aperture.places[:, axis].min())
+        # Places are in wavelengths: cosines in [-1, 1] have 2 extent + 1 resolution cells.
         cells = max(1, round(2 * s.oversampling * (extent * 2 + 1) / 2)) if extent > 1e-6 else 1
         axes.append((torch.arange(cells) + 0.5) / cells * 2 - 1)
     step = 1 / (len(aperture.tones) * s.oversampling)

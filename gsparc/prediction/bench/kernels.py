@@ -58,6 +58,7 @@ def static(scene: Scene, batch: int) -> Case:
         values = scene.model.features(tx, pose if batch == 1 else Pose.identity(places(batch)))
         return composite(layout, *scene.geometry, values).image
 
+    # The view of a static receiver is one, whatever the batch: so is the dense plan.
     dense = scene.plan(pose, backend="reference") if _dense_bytes(scene, 1) <= REFERENCE_BYTES else None
     return Case(
         *("forward, static receiver", scene.projection, len(scene), batch),
@@ -77,6 +78,7 @@ def frozen(scene: Scene, batch: int) -> Case:
     tx, rx = places(batch) + 1, Pose.identity(places(batch))
     return Case(
         *("forward, frozen", scene.projection, len(scene), batch),
+        # The matrix is read once and images are written: no exponential is left.
         work=Work(size(view.buffers) + features.nbytes + _image_bytes(batch * COMPLEX)),
         kernel=lambda: view.render(features, version=0),
         whole=lambda: whole.render(scene.model, tx, rx),
@@ -118,6 +120,7 @@ def backward(scene: Scene, batch: int) -> Case:
         work=Work(2 * work.bytes, work.pairs),
         kernel=kernel,
         whole=whole,
+        # Autograd keeps all dense tensors: of 1,000 Gaussians these are 1.6 GB.
         reference=dense if batch == 1 and len(scene) <= 1000 else None,
         unaffordable=_too_big(scene, 2),
     )
@@ -126,6 +129,7 @@ def backward(scene: Scene, batch: int) -> Case:
 def weights(scene: Scene, batch: int) -> Case:
     """Time visible shares for channels: plan and weights (kernel)."""
     poses = receivers(batch)
+    # Channels sum over all directions: their pairs are those on the full sphere.
     pairs = machine_limits.pairs(scene.plan(poses, channels=True))
     return Case(
         *("weights, moving receiver", scene.projection, len(scene), batch),

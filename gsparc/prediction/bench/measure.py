@@ -96,6 +96,7 @@ class Row:
 def timed(calls: Mapping[str, Call | None], clock: ClockSettings) -> dict[str, np.ndarray]:
     """Time calls in turns [ms]; None is left out."""
     known = {name: call for name, call in calls.items() if call is not None}
+    # A default argument binds each call: the closure alone would call the last one for all.
     return interleaved({name: lambda turn, call=call: call() for name, call in known.items()}, clock)  # type: ignore[misc]
 
 
@@ -133,6 +134,7 @@ def measure(
         moved, counted = machine.copy(), machine.exponentials()
         calls = {"kernel": case.kernel, "whole": case.whole}
         times = timed(calls | {"exponentials": machine.exponentials, "copy": machine.copy}, clock)
+        # A dense reference may take seconds: after half a second no new round begins.
         once = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
         reference = timed({"it": case.reference if references else None}, once).get("it")
     finally:

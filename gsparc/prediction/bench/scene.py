@@ -18,9 +18,11 @@ from gsparc.ops.projection import Projection
 from gsparc.ops.settings import IMAGE_CUTOFF
 
 ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
+# Images show the upper hemisphere; channels need all directions, at half the resolution.
 GRID = SphereGrid.hemisphere()
 CHANNEL_GRID = SphereGrid.full_sphere(90, 180)
 CHANNEL_CUTOFF = Cutoff(1e-3, relative=True)
+# Networks of the paper, 3-16-2, and larger ones on Fourier features, 63-32-2.
 PAPER = EmissionSettings(EncodingSettings("raw"), 16, "sigmoid", log_distance=True, init_bias=0.0)
 NETWORK = EmissionSettings(EncodingSettings("fourier"), 32, "sigmoid", log_distance=True, init_bias=0.0)
 COMPLEX = 2  # real channels
@@ -68,6 +70,7 @@ def scene(
     """Return a room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
     # Seeded without touching the draws of whoever calls.
     with torch.random.fork_rng():
+        # By its size, so that a scene is the same whichever were made before it.
         torch.manual_seed(count)
         settings = ModelSettings(
             FieldSettings(count=count, placement="uniform", margin=0.0),
@@ -101,7 +104,9 @@ def receiver() -> Pose:
 @torch.no_grad()
 def _scatter(field: GaussianField) -> None:
     field.log_scales.add_(torch.randn_like(field.log_scales), alpha=0.5)
+    # Normal numbers, once they are normalised, are uniform rotations.
     field.quats.copy_(torch.randn_like(field.quats))
+    # About 0.27 in the median, from nearly transparent to nearly opaque.
     field.opacity_logits.copy_(1.5 * torch.randn_like(field.opacity_logits) - 1)
 
 

@@ -135,6 +135,7 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
     area = _area(scene, tracer.box()[:, :2] if town is None else town.box)
     ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
     georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
+    # Heights of masts count from the highest surface, a roof where there is one.
     masts = _stated(scene, tracer.height, georeference) or [_in_the_middle(tracer, ground, area)]
     placed = receivers(
         layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, ground, streets,
@@ -171,6 +172,7 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
     for path in (scene.file, scene.xml):
         if path is not None and not Path(path).is_file():
             raise ValueError(f"the scene's file {path} is not here; name it with model.scene=FILE")
+    # Permittivities depend on the carrier (ITU-R P.2040).
     return replace(scene, carrier_hz=carrier_hz)
 
 
@@ -228,7 +230,9 @@ def _load(
         if scene.builder not in BUILDERS:
             raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
         source = BUILDERS[scene.builder](scene.seed)
+        # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
         allowed = clear_of(source)
+    # At the origin for the time being: `at` puts a copy at each transmitter.
     return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
 
 
@@ -268,6 +272,7 @@ def _in_the_middle(tracer: RayTracer, ground: Ground, area: np.ndarray) -> Trans
 def _around(scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> Ground:
     """Places about the surfaces that rays find; an area (2, 2) [m] is looked at for a ceiling."""
     open_sky = tracer.has_open_sky(area) if scene.open_sky is None else scene.open_sky
+    # Under a ceiling the highest surface is the ceiling: heights count from zero.
     over = scene.over if open_sky else "zero"
 
     def lift(points: np.ndarray) -> np.ndarray:

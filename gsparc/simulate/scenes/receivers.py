@@ -114,6 +114,7 @@ def receivers(
         def allowed(points: np.ndarray) -> np.ndarray:
             return ground.allowed(ground.lift(points))
 
+        # Drawn with heights above the ground, tested and returned in the world.
         return Placed(ground.lift(place(count, area, height, allowed, seed)))
     if how.kind == "file":
         flat, time_s = _of_file(how, georeference, float(np.mean(height)))
@@ -271,6 +272,7 @@ def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndar
         for low, high in boxes:
             free &= ~np.all((points >= low - margin) & (points <= high + margin), axis=1)
         for corners in walls:
+            # Corners go around a sheet: its first and its last side span the plane.
             normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
             normal /= np.linalg.norm(normal)
             # Distance to the plane of a sheet; its box bounds the rest.

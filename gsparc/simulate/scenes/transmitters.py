@@ -92,6 +92,7 @@ def stations(
         mast = from_settings(Mast, entry, where)
         if not 1 <= mast.sectors <= 12:
             raise ValueError(f"{where}.sectors={mast.sectors}: expected 1 to 12")
+        # Isotropic sectors of a mast would all be the same station.
         pattern = mast.pattern or ("tr38901" if mast.sectors > 1 else "iso")
         if pattern not in PATTERNS:
             raise ValueError(f"{where}.pattern={pattern}: expected one of {', '.join(PATTERNS)}")
@@ -102,6 +103,7 @@ def stations(
             label = name if mast.sectors == 1 else f"{name}-{sector + 1}"
             transmitters.append(Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
     names = [one.name for one in transmitters]
+    # Files tell stations apart by their names.
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"scene.transmitters: {twice[0]!r} twice; expected a name for each")

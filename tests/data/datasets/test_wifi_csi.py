@@ -91,6 +91,17 @@ def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
     assert len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
 
 
+def test_a_packet_of_zeros_made_all_levels_nan(tmp_path, caplog):
+    parts = np.random.default_rng(0).integers(20, 90, (5, 128))
+    parts[2] = 0
+    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
+    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
+    (tmp_path / "walk.csv").write_text("".join(lines))
+    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
+    raw = raw_of_wifi_csi(tmp_path).arrays
+    assert len(raw["csi"]) == 4 and np.isfinite(raw["csi"]).all() and "1 packets" in caplog.text
+
+
 def test_logs_that_are_none(robot, tmp_path, refused, monkeypatch):
     refused("places.csv: missing; expected a table of places", raw_of_wifi_csi, robot)
     table = tmp_path / "places.csv"

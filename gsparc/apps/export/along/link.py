@@ -24,6 +24,7 @@ class TrajectoryChannel(ChannelModel):
     def __init__(self, path: str | Path, seed: int = 0) -> None:
         super().__init__()
         arrays = read_raw(path).arrays
+        # Instants are so close that a cubic spline between them errs less than the taps do.
         self._gain = CubicSpline(arrays["time_s"], arrays["gain"])
         self._time, self._delay = arrays["time_s"], torch.from_numpy(arrays["delay_s"])
         self._receives = "tx_position" in arrays  # the array does
@@ -33,10 +34,12 @@ class TrajectoryChannel(ChannelModel):
         self, batch_size: int, num_time_steps: int, sampling_frequency: float
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Gains [B, 1, rx_ant, 1, tx_ant, L, T] complex, and delays [B, 1, 1, L] [s]; see Sionna."""
+        # Samples stand at both ends: one interval fewer than their number.
         length = (num_time_steps - 1) / sampling_frequency
         spare = self._time[-1] - self._time[0] - length
         if spare < 0:
             raise ValueError(f"{length:g} s of channel from a trajectory of {np.ptp(self._time):g} s")
+        # Somewhere in the trajectory, uniformly, so that a batch is of independent stretches.
         begin = self._time[0] + self._draw.uniform(0, 1, (batch_size, 1)) * spare
         gain = torch.from_numpy(self._gain(begin + np.arange(num_time_steps) / sampling_frequency))
         gain = gain.permute(0, 2, 3, 1)[:, None, :, None, None] if self._receives else (

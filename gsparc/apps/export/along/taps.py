@@ -51,6 +51,7 @@ class Trajectory:
     def instants(self, wavelength: float) -> np.ndarray:
         """Times (T,), a part of a wavelength apart, at which a channel is to be known; four or more."""
         length = float(self.time_s[-1] - self.time_s[0])
+        # Four at least: a cubic spline needs them.
         count = max(int(np.ceil(length * self.fastest * PER_WAVE / wavelength)) + 1, 4)
         if count > MOST:
             far = f"the trajectory is {length * self.fastest / wavelength:.0f} wavelengths long"
@@ -85,12 +86,14 @@ class Line:
 
     def doppler_hz(self) -> np.ndarray:
         """Mean Doppler shift (A, L) float64 [Hz] of each tap: the phase it gains from instant to instant."""
+        # The mean of products weighs each step by its power: a fade's phase is noise.
         turned = (self.gain[1:] * self.gain[:-1].conj()).sum(0, dtype=np.complex128)
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
 
     def path_doppler_hz(self) -> np.ndarray:
         """Doppler shifts (T, A, N) [Hz] of the paths: how fast their delays shrink."""
         assert self.paths is not None
+        # Doppler is -f d(delay)/dt: a path that shortens has a positive shift.
         return -self.carrier_hz * np.gradient(self.paths.delay_s, self.time_s, axis=0)
 
 
@@ -119,6 +122,7 @@ def write_impulses(
         arrays["path_doppler_hz"] = line.path_doppler_hz()
     about = {"rate_hz": line.rate_hz, "carrier_hz": line.carrier_hz, "residual": line.residual}
     write_raw(file, Raw(arrays, about, units))
+    # 1e-30 is -300 dB: no residual at all has no decibels.
     left, worst = 10 * np.log10(np.maximum([line.residual, line.worst], 1e-30))
     return {
         "taps/count": line.gain.shape[2], "taps/rate_hz": line.rate_hz, "taps/residual_db": float(left),
@@ -149,6 +153,7 @@ def fitted(
     tones = site.tones()
     if rate_hz is None and len(tones) == 1:
         raise ValueError(f"rate_hz= is needed: {site.name} was measured at one frequency")
+    # The band where all tones are in use; with gaps it is too narrow, which is refused below.
     rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
     time_s = way.instants(LIGHT / carrier)
     places, parts = way.at(time_s), list[Paths]()
@@ -167,11 +172,13 @@ def fitted(
     known, rays = ask(look), located_paths(predictor, look, antennas)
     if rays is not None and np.linalg.norm(rays.channel(tones) - known) < SAME * np.linalg.norm(known):
         tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
+        # Delays count from `taps` samples before the first path: all are then positive.
         early = np.floor(rays.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
         known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
         parts.clear()
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
+    # No more taps than equations, of which each tone is one.
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
     first = int(early or 0) + _first(known, turns, taps)
     columns, solve = _atoms(turns, first, taps)
@@ -194,7 +201,7 @@ def fitted(
 
 
 def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
-    """Of the first antennas at places (B, 3) [m, world]; None where the model is not made of paths."""
+    """Return paths of the first antennas at places (B, 3) [m, world]; None of a model without paths."""
     try:
         paths = predictor.paths(**{predictor.site.moving_end: place})
     except ValueError:
@@ -223,5 +230,7 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
         columns, solve = _atoms(turns, first, taps)
         return float(np.square(np.abs(rows @ solve.T @ columns.T - rows)).sum())
 
+    # The profile's maximum is within a few samples of the best, which least squares then decides.
     best = min(range(middle - 4, middle + 5), key=residual)
+    # In the second half of the period a delay is nearer as a negative one.
     return best if best < apart / 2 or apart <= taps else best - apart

@@ -12,6 +12,7 @@ import numpy as np
 from gsparc.data.files import whole_file
 from gsparc.prediction.predictor import Predictor
 
+# \r\n as in PNG: a transfer as text would change it, which is then found out. 64: a cache line.
 MAGIC, VERSION, LINE = b"GSPARC\r\n", 2, 64
 TYPES = {np.dtype(t): i for i, t in enumerate((np.float32, np.float64, np.int32, np.int64))}
 HEAD, SECTION = struct.Struct("<8sIIqq"), struct.Struct("<24sIIqq")
@@ -36,17 +37,19 @@ class Form:
 
 
 def packed(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
-    """The file's bytes; places are from `origin` (3,) [m], errors are those of `Compiled`."""
+    """Return the file's bytes; places are from `origin` (3,) [m], errors are those of `Compiled`."""
     numbers = np.array([form.kind, error, worst, *origin, *form.numbers], np.float64)
     arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
     at = HEAD.size + SECTION.size * len(arrays)
     table, body = [], []
     for name, value in arrays.items():
+        # Sections begin at cache lines: C reads vectors from the file as it is mapped.
         gap = -at % LINE
         body += [bytes(gap), np.ascontiguousarray(value).tobytes()]
         table.append(SECTION.pack(name.encode(), TYPES[value.dtype], 0, at + gap, value.size))
         at += gap + value.nbytes
     checked = struct.pack("<qq", at, len(arrays)) + b"".join([*table, *body])
+    # The sum covers sizes and all arrays, but not itself and what comes before it.
     return HEAD.pack(MAGIC, VERSION, zlib.crc32(checked), at, len(arrays))[:CHECKED] + checked
 
 

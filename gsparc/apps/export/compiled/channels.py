@@ -12,17 +12,20 @@ from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import elements, static_array
 from gsparc.physics.waves import evenly_spaced
 
+# 16 float32 are the widest register; narrower ones take the same rows in two or four steps.
 LANES = 16
+# Rows that fill the last register: far away and of weight 0, so that they add nothing.
 BEYOND = 1e6  # [m], a place that is near none
 
 
 def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
-    """Of an ensemble's sources without clutter, whose gains `query` has."""
+    """Return the form of an ensemble's sources without clutter, whose gains `query` has."""
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(query.sources), len(query.places)
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES
     weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
     array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
+    # The pose of a receiver turns its array with it; a transmitter's array stands in the site's frame.
     if site.moving_end == "rx":
         turned = torch.from_numpy(np.asarray(rotation, np.float32)).double()[None]
         moving = elements(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
@@ -35,7 +38,9 @@ def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
 
     tones = torch.from_numpy(site.tones())
     step = float(tones.diff().mean()) if len(tones) > 1 else 0.0
+    # Two tones are evenly spaced whatever they are.
     even = len(tones) < 3 or evenly_spaced(tones)
+    # A comb of even tones costs one complex product per tone; uneven ones a sine each.
     combs = [(tones[0], step, len(tones))] if even else [(tone, 0.0, 1) for tone in tones]
     factors = (method.frame.scale * site.target_scale / method.factors).numpy().astype(np.complex64)
     arrays = {

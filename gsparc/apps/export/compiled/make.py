@@ -59,8 +59,8 @@ SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
 def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled:
-    """The form of a model of one station; its error is measured at `count` random places, and a quarter more
-    near the other end, where powers are largest.
+    """Return the form of a model of one station, its error measured at `count` random places, and a quarter
+    more near the other end, where powers are largest.
 
     Raises:
         ValueError: no form answers as this model does, or it is of several stations.
@@ -71,15 +71,18 @@ def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled
         raise ValueError(f"station= is needed, one of {', '.join(site.stations.name)}")
     if site.static_end is None and site.kind != "rssi":
         raise ValueError(f"{method.name} of two moving ends has no compiled form; only powers have")
+    # An exact form is not measured: its error is that of rounding to float32.
     exact = exact_form(method, site)
     if exact is not None:
         return Compiled(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
     form = distilled_form(predictor, seed)
     assert form.predictor is not None
+    # Other seeds than that of the places distilled from, or the error would be that of known places.
     near = near_places(site, max(1, count // 4), seed + 2)
     places = np.concatenate([random_places(site, count, seed + 1), near])
     parts = [_squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)]
     squared, power = np.concatenate(parts, axis=1)
+    # The worst may be near the station, the mean is over random places alone.
     found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
     error, worst = np.maximum(np.sqrt(found) if site.kind == "rssi" else found, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
@@ -90,6 +93,7 @@ def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarra
     """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
     own, whole = (answers(one, places).reshape(len(places), -1) for one in (form, model))
     if model.site.kind == "rssi":
+        # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
         own, whole = 10 * np.log10(np.maximum(own / whole, SILENT)), np.zeros_like(whole)
     squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (own - whole, whole))
@@ -101,9 +105,10 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 
 
 def exact_form(method: Method, site: Site) -> Form | None:
-    """The form whose answers are the model's but for rounding; None where there is none."""
+    """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
         return None if method.only is None else exact_form(method.only, site)
+    # The process beside sources has no form: where it has no share, the sources are the model.
     if isinstance(method, Residual):
         return exact_form(method.method, site) if method.rest is None or not method.share else None
     if isinstance(method, PowerField):
@@ -136,7 +141,7 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
 
 
 def distilled_form(predictor: Predictor, seed: int) -> Form:
-    """A form near a model: its array's part alone, or a process given its answers at random places.
+    """Return a form near a model: its array's part alone, or a process given its answers at random places.
 
     Raises:
         ValueError: channels that are not made of sources.
@@ -146,6 +151,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
         own_form = _rendered(method, site)  # without the process that it is averaged with
         if own_form is not None:
             alone = copy.copy(method)
+            # A copy: the model of the caller keeps the process that it is averaged with.
             alone._average = None
             return replace(own_form, predictor=Predictor(alone, site))
     sources = _sources_of(method) if site.kind == "csi" else None
@@ -153,6 +159,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
     if sources is not None:
         return _sources_given(sources, data)
     every = np.arange(len(data))
+    # All rows are learned from: a model's answers have no noise that validation would guard against.
     process = GaussianProcess(KEPT)
     process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
     form = exact_form(process, site)
@@ -175,9 +182,11 @@ def _sources_of(method: Method) -> ImageSourceGP:
 def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     """The heaviest search's sources without clutter, their gains given a model's answers."""
     member = method.members[int(torch.as_tensor(method.weights).argmax())]
+    # Sources work in their own unit, in which rows' factors are divided out.
     data = replace(data, target=data.target * method.factors.numpy()[:, None])
     rows = method.frame.inside(gather(data, np.arange(len(data)), len(data), method.settings.seed))
     scene = replace(member.scene, clutter=Clutter.none())
+    # Without __init__: its sources are given, and searching is what would be repeated.
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))
     alone._conditioned(rows, [scene])
@@ -197,6 +206,7 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
     other = places[:, :3] if site.static_end is None else site.static_position
     if other is None:  # nobody knows where
         return places
+    # Logarithmic: powers, and with them errors, grow by decades towards the end that stands.
     share = NEAREST ** np.random.default_rng(seed).uniform(size=(count, 1))
     places[:, -3:] = (other + share * (places[:, -3:] - other)).clip(low[-3:], high[-3:])
     return places
@@ -209,7 +219,7 @@ def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
-    """The model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
+    """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
     site = predictor.site
     parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
     asked = [{end: at + site.origin for end, at in part.items()} for part in parts]

@@ -13,13 +13,15 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess
 from gsparc.processes.trend import TINY_M
 
+# A leaf is searched row by row: 16 rows are two registers of distances.
 LEAF = 16  # rows
+# Beyond any place that the library answers (1e7 m), so that padding is never near.
 BEYOND = 1e9  # [m], a place that is near none
 LANES = 8
 
 
 def powers_form(process: PowerProcess, scale: float) -> Form | None:
-    """The form of a process; None where its terms are others than compiled.
+    """Return the form of a process; None where its terms are others than compiled.
 
     Args:
         process: given its rows.
@@ -38,6 +40,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     nearest = posterior._near if isinstance(posterior, Exact) else posterior
     columns = posterior._columns
     if isinstance(posterior, Exact):
+        # Exact: one product with weights. Nearest: each query solves its own small system of `values`.
         values, weighed = posterior.weights[:, 0], columns.T @ posterior.weights
         noise = kernel.noise + posterior.extra
     else:
@@ -51,13 +54,16 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         unsure = nearest.spread.numpy()
     else:
         whole = posterior.factor.root.numpy()  # type: ignore[union-attr]
+        # The lower triangle row by row, half of the square matrix's bytes.
         root = whole[np.tril_indices(count)]
     law, lengths, shares = trend.law, [*signed, 1.0][:2], [*kernel.shares, 0.0][:2]
+    # Without a law a constant stands for it: exponent 0, floor 1.
     about = [trend.level, 0.0, 1.0] if law is None else [law.level, law.exponent, max(law.floor, TINY_M)]
     beside = np.full((places.shape[1], -(-count // LANES) * LANES), BEYOND)
     beside[:, :count] = places[order].T
     arrays = {
         "places": places[order], "columns": beside if every else np.zeros(0),
+        # JITTER as the process itself adds it before its Cholesky factor.
         "extra": noise.numpy()[order] + JITTER, "values": values.double().numpy()[order],
         "slopes": columns.numpy()[order], "weighed": weighed.numpy(), "unsure": unsure, "root": root,
         "still": np.array([] if law is None else law.place or [], np.float64), "sets": sets, "boxes": boxes,
@@ -74,6 +80,7 @@ def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.n
     """Order of the rows (n,), rows, neighbours and depth of each set (S, 3), and boxes of all nodes."""
     order, sets, boxes = [], [], []
     for rows, neighbours in near.shares(most):
+        # Depth such that leaves have about LEAF rows.
         depth = max(0, math.ceil(math.log2(len(rows) / LEAF)))
         own, tree = _tree(near.places[rows], depth)
         order.append(rows[own])
@@ -87,6 +94,7 @@ def _tree(places: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
     order, count, boxes = np.arange(len(places)), len(places), []
     for level in range(depth + 1):
         for node in range(1 << level):
+            # Shifts instead of lengths: both halves of every node differ by one row at most.
             part = slice(count * node >> level, count * (node + 1) >> level)
             inside = places[order[part]]
             low, high = inside.min(0), inside.max(0)
@@ -94,5 +102,6 @@ def _tree(places: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
             if level < depth:
                 axis = int((high - low).argmax())
                 middle = (count * (2 * node + 1) >> (level + 1)) - part.start
+                # argpartition, not a sort: only which side of the middle a row is on matters.
                 order[part] = order[part][np.argpartition(inside[:, axis], middle)]
     return order, np.array(boxes)

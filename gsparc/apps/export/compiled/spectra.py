@@ -17,7 +17,7 @@ ACTIVATIONS = {"linear": 0, "sigmoid": 1, "softplus": 2}
 
 
 def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
-    """Of an array's field; None where its emissions are no process of places."""
+    """Return the form of an array's field; None where its emissions are no process of places."""
     encoding = model.emission.encoding
     if frozen.weights is None or frozen.offset is None or not model.tells_unknown:
         return None
@@ -36,10 +36,11 @@ def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
 
 
 def view_form(frozen: FrozenView) -> Form | None:
-    """Of Gaussians before a static receiver; None where emissions are networks of other than similarities."""
+    """Return the form of Gaussians before a static receiver; None of networks of other than similarities."""
     model = frozen.visible
     emission, encoding, attenuation = model.emission, model.emission.encoding, model.settings.attenuation
     settings = emission.settings
+    # Only the processor's plan holds blocks of pixels as the file does.
     if encoding.settings.kind != "kernel" or settings.hidden or frozen.plan.backend != "cpu":
         return None
     starts, ranks, weights = (part.numpy() for part in frozen.plan.buffers)
@@ -51,6 +52,7 @@ def view_form(frozen: FrozenView) -> Form | None:
         *encoding.anchors.shape[::-1], encoding.width, *parts_of(encoding.length, encoding.kernel),
         len(means), height, width, ACTIVATIONS[settings.activation], settings.log_distance,
         attenuation.inverse_distance, model.tells_unknown, float(model.log_gain.detach().exp()),
+        # Squared here once, since the library compares squared distances.
         attenuation.d_min**2, 1 / model.d_ref**2,
     ]  # fmt: skip
     arrays = {
@@ -63,7 +65,7 @@ def view_form(frozen: FrozenView) -> Form | None:
 
 
 def process_form(process: GaussianProcess) -> Form | None:
-    """Of a process on whole spectra given its rows: images of its components, none left out."""
+    """Return the form of a process on whole spectra given its rows: images of all its components."""
     scores = process.scores
     if not isinstance(scores, Exact) or scores.prior.trend is not None:
         return None
@@ -71,6 +73,7 @@ def process_form(process: GaussianProcess) -> Form | None:
     images = torch.cat([process.mean[None], process.axes]).unflatten(1, process.shape).numpy()
     count, height, width = images.shape
     tall, wide = -(-height // ROWS), -(-width // COLUMNS)
+    # Filled up to whole blocks with zeros, which the library computes and does not write.
     whole = np.zeros((count, tall * ROWS, wide * COLUMNS), np.float32)
     whole[:, :height, :width] = images
     blocks = whole.reshape(count, tall, ROWS, wide, COLUMNS).transpose(1, 3, 0, 2, 4)
@@ -80,6 +83,7 @@ def process_form(process: GaussianProcess) -> Form | None:
         count, height, width, ACTIVATIONS["linear"], 0, 0, 0, 1.0, 0.0, 1.0,
     ]  # fmt: skip
     arrays = {
+        # Component 0 is the mean image, with weight 1 at every place.
         "at": places, "whitening": weights, "weights": np.eye(count, dtype=np.float32)[1:],
         "offset": np.eye(1, count, dtype=np.float32)[0], "blocks": blocks.reshape(-1, ROWS * COLUMNS),
         "starts": np.arange(tiles + 1, dtype=np.int64) * count,
@@ -97,6 +101,7 @@ def _widened(
         return starts, ranks, weights
     per, across = COLUMNS // columns, -(-width // columns)
     tile = np.repeat(np.arange(len(starts) - 1), np.diff(starts)) % across
+    # Zero where a narrower block ends: its pixels add nothing.
     blocks = np.zeros((len(weights), ROWS, COLUMNS // columns, columns), np.float32)
     blocks[np.arange(len(weights)), :, tile % per] = weights.reshape(-1, ROWS, columns)
     first = np.arange(0, across, per) + across * np.arange((len(starts) - 1) // across)[:, None]

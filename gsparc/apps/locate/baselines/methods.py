@@ -49,7 +49,7 @@ def least_error(
     settings: Sequence[Setting], fit: Callable[[Setting, np.ndarray, np.ndarray], Locator],
     features: np.ndarray, places: np.ndarray,
 ) -> Setting:  # fmt: skip
-    """The setting of least median error at places left out, a fifth at a time; the first of few places."""
+    """Return the setting of least median error at places left out, a fifth at a time; else the first."""
     rows = np.random.default_rng(0).permutation(len(features))[:MAX_ROWS]
     group = np.unique(places[rows], axis=0, return_inverse=True)[1].reshape(-1)
     if len(settings) == 1 or group.max() + 1 < FOLDS:
@@ -75,7 +75,7 @@ def neighbours(
     features: np.ndarray, places: np.ndarray, counts: Sequence[int] = COUNTS,
     weights: Literal["uniform", "distance"] = "distance",
 ) -> Locator:  # fmt: skip
-    """The mean place of the best number of nearest rows, alike or weighted by the inverse of their distance.
+    """Locate at the mean place of the best number of nearest rows, alike or by their inverse distances.
 
     P. Bahl and V. Padmanabhan, "RADAR: an in-building RF-based user location and tracking system", INFOCOM
     2000.
@@ -89,7 +89,7 @@ def neighbours(
 
 
 def kernel(features: np.ndarray, places: np.ndarray, widths: Sequence[float] = WIDTHS) -> Locator:
-    """A density of features at each training place: a Gaussian kernel of the best width about each row there.
+    """Fit a density of features at each training place: a Gaussian kernel of the best width about each row.
 
     T. Roos et al., "A probabilistic approach to WLAN user location estimation", Int. J. Wireless Information
     Networks 9 (2002).
@@ -111,7 +111,7 @@ def kernel(features: np.ndarray, places: np.ndarray, widths: Sequence[float] = W
 
 
 def process(features: np.ndarray, places: np.ndarray, seed: int = 0) -> Locator:
-    """A Gaussian process of each feature, all with one kernel; features at a training place are Gaussian.
+    """Fit a Gaussian process to each feature, all of one kernel; features at a training place are Gaussian.
 
     B. Ferris et al., "Gaussian processes for signal strength-based location estimation", RSS 2006.
     """

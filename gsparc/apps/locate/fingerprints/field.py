@@ -79,7 +79,7 @@ class FingerprintField:
 
     @torch.no_grad()
     def moments(self, places: Tensor) -> Levels:
-        """Of places (B, 3) float64 [m]."""
+        """Return what would be heard at places (B, 3) float64 [m]."""
         at = torch.from_numpy(stretched(places.detach().double().numpy(), self.vertical))
         answer = self.process.answer(at)
         heard, level = (answer.mean.unflatten(1, (2, -1)) + self.mean).unbind(1)
@@ -101,7 +101,7 @@ def calibrated(heard: Tensor, odds: tuple[float, float]) -> Tensor:
 def learn(
     levels: np.ndarray, places: np.ndarray, seed: int = 0, like: FingerprintField | None = None
 ) -> FingerprintField:
-    """The field of rows, with the kernel of another where one is given.
+    """Return the field of rows, with the kernel of another where one is given.
 
     Example:
         field = learn(rows.level[train], rows.position[train])
@@ -167,7 +167,7 @@ def shifted(odds: Tensor, here: Tensor, deviation: float) -> Tensor:
 
 
 def misfit(levels: Tensor, at: Levels, offset: float | None, sensitivity: float = 0.0) -> Misfit:
-    """Of m fingerprints at places, in single precision; what is heard and what not is its `silent`.
+    """Return the misfit of m fingerprints at places, in float32; what is heard and what not is its `silent`.
 
     Args:
         levels, at: (m, P) [dBm], NaN where silent; of B places.

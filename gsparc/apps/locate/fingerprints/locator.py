@@ -60,7 +60,7 @@ class FingerprintLocator:
         return cls(field, cells, field.moments(torch.from_numpy(cells.centre)), around, offset_db, pace)
 
     def look(self, rows: Fingerprints) -> Iterator[Looked]:
-        """The misfit of each row at all cells, or what its whole walk says."""
+        """Return the misfit of each row at all cells, or what its whole walk says."""
         single = (
             Looked(self.cells, misfits.of(number))
             for level in torch.from_numpy(rows.level).split(ROWS)
@@ -90,7 +90,7 @@ class FingerprintLocator:
 
 
 def place(posterior: Posterior) -> np.ndarray:
-    """The mean (3,) [m] of the floor that has most mass, which errs less than the likeliest cell."""
+    """Return the mean (3,) [m] of the floor that has most mass, which errs less than the likeliest cell."""
     mass, centre = posterior.mass, posterior.cells.centre
     floor = np.unique(centre[:, 2], return_inverse=True)[1].reshape(-1)
     there = floor == np.bincount(floor, mass).argmax()
@@ -101,7 +101,7 @@ def trusted(
     locator: FingerprintLocator, rows: Fingerprints, how: How, side_m: float, held_out: float, groups: int,
     share: float, seed: int,
 ) -> tuple[FingerprintLocator, int]:  # fmt: skip
-    """The same with trusts of rows that were left out, and the number of these.
+    """Return the same with trusts of rows that were left out, and the number of these.
 
     The field is learned again, with its kernel, without each of a few `groups` of rows, drawn like test rows
     (`how`, `side_m`, `held_out`: see `parted`). Areas are calibrated on them to hold a `share` of places; of
@@ -128,6 +128,6 @@ def trusted(
 
 
 def as_snapshots(rows: Fingerprints) -> Snapshots:
-    """What plain methods learn from."""
+    """Return what plain methods learn from."""
     values = torch.from_numpy(rows.level).double()
     return Snapshots("rssi", values, None, rows.position, np.arange(len(values)))

@@ -55,7 +55,7 @@ def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, A
 
 
 def path_of(name: str) -> str:
-    """Of a node, without what separates nodes."""
+    """Return the path of a node, its name without what separates nodes."""
     return "/" + name.replace("/", " ")
 
 
@@ -72,7 +72,7 @@ def _sheet(api: Any, frame: Frame, part: Sheet) -> Any:
 
 
 def floor(api: Any, scene: Scene) -> float:
-    """A grid beneath the scene; returns the side of its cells [m]."""
+    """Draw a grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale
     side = 10.0 ** np.floor(np.log10(wide / 5))

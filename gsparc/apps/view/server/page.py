@@ -33,7 +33,7 @@ LIMITS = (
 
 
 def page(view: SiteView, steps: int = STEPS) -> str:
-    """The page as text; about 1 MB, most of it the viewer.
+    """Return the page as text; about 1 MB, most of it the viewer.
 
     Args:
         view: the model; its stations are shown one after another, as many as get `LEAST` places.

@@ -216,6 +216,7 @@ class Session:
         if not self.view.has(value):
             self.title.content = f"**{value} is being prepared ...**"
         self.view.station(value)
+        # Meanwhile another may have been chosen: only the last is shown.
         if self.chosen_station == value:
             self.work.ask((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
 
@@ -233,6 +234,7 @@ class Session:
         self.station, self.one = name, self.view.station(name)
         choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
         visibility = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        # All at once, or a client sees half of two stations.
         with self.client.atomic():
             self._draw_still()
             for name, visible in visibility.items():
@@ -251,6 +253,7 @@ class Session:
             return
         self._show(answer)
         self.answers += 1
+        # The picture has a key of its own: a later answer replaces it before it is drawn.
         self.work.ask((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
 
@@ -307,6 +310,7 @@ class Session:
                 continue
             if beyond and known is not None and there is not None:
                 plane = beyond_distance(plane, known, there)
+                # Three deviations of measured levels at both ends, of a diverging map about 0.
                 most = max(3 * known.spread_db, 1.0)
                 label = "power more than distance alone explains [dB]"
                 legend = legend or Legend(label, -most, most, "PuOr")

@@ -86,7 +86,7 @@ Piece = Dense | Factored
 
 @dataclass(frozen=True)
 class Basis:
-    """Of places that differ by one displacement at most.
+    """Orthonormal columns for places that differ by one displacement at most.
 
     Attributes:
         key: of the places, then of what else decides the columns.

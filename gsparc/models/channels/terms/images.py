@@ -42,6 +42,7 @@ class Images(Spherical):
         """Return waves (W, n), see `Spherical`; 0 of planes that have the end and the middle on two sides."""
         both = torch.stack([at.slot.end + self.frame.offset, self.frame.middle], 1)
         sides = self.planes[:, :3] @ both - self.planes[:, 3:]
+        # A mirror reflects to the side that it is lit from.
         return super().waves(at) * (sides[:, :1] * sides[:, 1:] > 0)
 
     @property

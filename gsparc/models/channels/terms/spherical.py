@@ -39,6 +39,7 @@ class Spherical(ChannelTerm):
     @property
     def gains(self) -> tuple[Tensor, Tensor]:
         """Powers (W,) of fixed gains, and of those that vary."""
+        # In the order of `pieces`: fixed gains of all waves, then varying ones.
         fixed, varying = self.power.view(2, -1)
         return fixed, varying
 

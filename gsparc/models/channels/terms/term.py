@@ -66,6 +66,7 @@ class ChannelTerm(Term[At]):
 
     def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
         """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
+        # A logarithm of 0 is unit power.
         return (Dense(basis.of_rows(self.at(self.power[:0].new_zeros(1)).covariance(at, at))[None]),)
 
     def design(self, slot: Slot) -> Tensor:

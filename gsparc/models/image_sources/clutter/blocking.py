@@ -36,36 +36,36 @@ class Clutter:
 
     @staticmethod
     def none() -> Clutter:
-        """No boxes, infinite mirrors."""
+        """Return clutter of no boxes and infinite mirrors."""
         return Clutter(torch.zeros(0, 6), torch.zeros(0, 4), ())
 
     def __len__(self) -> int:
         return len(self.boxes) + len(self.patches)
 
     def with_box(self, box: Tensor, at: int | None = None) -> Clutter:
-        """One more box (6,), in place `at`."""
+        """Return it with one more box (6,), in place `at`."""
         at = len(self.boxes) if at is None else at
         return replace(self, boxes=torch.cat([self.boxes[:at], box[None], self.boxes[at:]]))
 
     def with_patch(self, patch: Tensor, plane: int) -> Clutter:
-        """One more patch (4,)."""
+        """Return it with one more patch (4,)."""
         patches = torch.cat([self.patches, patch[None]])
         return replace(self, patches=patches, plane=(*self.plane, plane))
 
     def without(self, number: int) -> Clutter:
-        """One piece less; boxes count before patches."""
+        """Return it with one piece less; boxes count before patches."""
         boxes = [i for i in range(len(self.boxes)) if i != number]
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
     def renamed(self, new: dict[int, int]) -> Clutter:
-        """Planes of new indices; patches of planes without one are dropped."""
+        """Return it with planes of new indices; patches of planes without one are dropped."""
         patches = [i for i, plane in enumerate(self.plane) if plane in new]
         return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
 
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
-    """Visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
+    """Return the visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
     return Obstacles([clutter], [planes], [len(paths.valid)]).visible_share(paths, soft)
 
 
@@ -102,7 +102,7 @@ class Obstacles:
         self.axes = torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3)
 
     def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
-        """Visible share (K, n) in [0, 1] of each source."""
+        """Return the visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
             passed = torch.where(self.box_mask, past_boxes(paths, self.boxes, soft), 1.0)
@@ -131,7 +131,7 @@ class Obstacles:
 
 
 def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
-    """Share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
+    """Return the share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
     along = torch.where(along.abs() < 1e-6, 1e-6, along)
     inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
@@ -148,7 +148,7 @@ def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
 
 
 def within(points: Tensor, patches: Tensor) -> Tensor:
-    """Soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
+    """Return the soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
     return _inside([points[None, ..., 0], points[None, ..., 1]], patches, SOFT)
 
 
@@ -166,7 +166,7 @@ def _scene_of(counts: list[int]) -> Tensor:
 
 
 def tangents(plane: Tensor) -> Tensor:
-    """Two axes (2, 3) float32 along a plane (4,): level where they can be."""
+    """Return two axes (2, 3) float32 along a plane (4,): level where they can be."""
     normal = _units(plane[None])[0]
     up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
     first = ahead if normal[2].abs() > 0.7 else torch.linalg.cross(up, normal)

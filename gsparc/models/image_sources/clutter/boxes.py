@@ -27,7 +27,7 @@ def evolve(
     generator: torch.Generator,
     rounds: int = 14,
 ) -> tuple[Tensor, float]:
-    """The best descendant (d,) of parents (m, d), and its score, by a (mu, lambda) evolution strategy."""
+    """Return the best descendant (d,) of parents (m, d) of a (mu, lambda) strategy, and its score."""
     best, spread = score(parents), SPREAD
     for number in range(rounds):
         born = parents.repeat_interleave(CHILDREN, 0)
@@ -48,7 +48,7 @@ def evolve(
 def find_box(
     left: Unexplained, draws: int = 1000, parents: int = 12, seeds: Tensor | None = None
 ) -> tuple[Tensor, float]:
-    """The box (6,) whose shadow explains most, and its gain [nats].
+    """Return the box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
         left: what a shadow may explain.
@@ -73,7 +73,7 @@ def find_box(
 
 
 def inside_out(boxes: Tensor, room: Tensor) -> Tensor:
-    """Boxes (m, 6) cut to the room, their corners in order."""
+    """Return boxes (m, 6) cut to the room, their corners in order."""
     low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
     return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
 

@@ -40,7 +40,7 @@ MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
 def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
-    """The patch (4,) on a plane that, were its sequences seen only in it, explains most; and its nats."""
+    """Return the patch (4,) on a plane that explains most if sequences end on it alone, and its nats."""
     mine = [k for k, sequence in enumerate(left.scene.sequences) if number in sequence]
     few, waves = left.paths.take(mine), left.waves[:, mine]
     along = tangents(left.scene.planes[number])
@@ -88,7 +88,7 @@ class SmallMirror:
 
 
 def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
-    """At most so many small mirrors parallel to walls, best first.
+    """Return at most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
     and before each wall) are collected in a raster of where it is met; integral images give every rectangle.

@@ -43,9 +43,10 @@ class ReflectionPhasePrior:
 
     @staticmethod
     def of(scene: Scene) -> ReflectionPhasePrior:
-        """From a scene's phases, weighted by power."""
+        """Estimate from a scene's phases, weighted by power."""
         assert scene.phase is not None
         order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
+        # Three phases lie near 0 or pi by chance.
         if len(order) < 4:
             return ReflectionPhasePrior(0.0, 0.0)
         power = scene.log_amplitude.mul(2).exp() * (order > 0)
@@ -53,15 +54,16 @@ class ReflectionPhasePrior:
             (float((power * (phase - phase[0] - order * t).cos()).sum() / power.sum()), t)
             for t in (0.0, math.pi)
         )
+        # At 1 the concentration is infinite.
         share = min(max(share, 0.0), 0.97)
         return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
     def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Phases (K,) of sequences, given the transmitter's own."""
+        """Return phases (K,) of sequences, given the transmitter's own."""
         return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
 
     def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Negative log prior of phases (K,), the transmitter's first."""
+        """Return the negative log prior of phases (K,), the transmitter's first."""
         return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
 
 
@@ -73,12 +75,13 @@ def descend(
     soft: float,
     phase_prior: ReflectionPhasePrior,
 ) -> Scene:
-    """The most likely scene of `steps` steps; paths are those of the start."""
+    """Return the most likely scene of `steps` steps; paths are those of the start."""
     assert scene.phase is not None
     rows, old = residual.rows, scene.clutter
     start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
+    # Shorter memories than Adam's usual ones, of a thousand steps.
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
@@ -98,6 +101,7 @@ def descend(
         factored = residual.scene
         for value, count in ((planes, len(factored.planes)), (phase, len(factored.sequences))):
             if value.grad is not None:
+                # What the varying part was factored with stays; see the module's text.
                 value.grad[:count] = 0
         optimizer.step()
         for group in optimizer.param_groups:

@@ -49,6 +49,7 @@ class Residual:
         self.share = self._constant(constant, scene.quadrature)
         self.root = self._own.root
         self.white = self.root @ self.target
+        # Two matrices (2 n, 2 n) go; the root is all that is asked from here on.
         del self._cached, self._own
 
     def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
@@ -62,6 +63,7 @@ class Residual:
         """Constant share and noise by likelihood, in turn on a grid."""
         columns = stacked(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
         kernel, noise = scene.visibility, scene.log_noise
+        # The nearest on the grid, from which steps go either way.
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
         def cost(constant: float, noise: float) -> float:
@@ -71,6 +73,7 @@ class Residual:
             return _cost(whitened, white, self._determinant).item()
 
         best = cost(constant, noise)
+        # Twice: the likeliest noise moves with the constant share, and the share with it.
         for _ in range(2):
             place = CONSTANTS.index(constant)
             for direction in (-1, 1):
@@ -85,6 +88,7 @@ class Residual:
     def _factor(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
+        # Half of the variance in the real parts, half in the imaginary ones.
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
         self._own = Factor.of(covariance)
         self._determinant = 0.5 * float(self._own.log_determinant)
@@ -95,14 +99,14 @@ class Residual:
 
     # ---- the constant part ----
     def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
-        """Constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
+        """Return constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
         scaled = (self.waves if waves is None else waves) * (
             visible_share.T * log_amplitude.exp() * self.share
         )
         return self.root @ torch.cat([scaled.real, scaled.imag])
 
     def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
-        """Negative log likelihood (), in nats; differentiable."""
+        """Return the negative log likelihood (), in nats; differentiable."""
         return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
 
     def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
@@ -111,10 +115,11 @@ class Residual:
         inner, seen = _inner(columns, self.white)
         inverse = Factor.of(inner).inverse
         mean, spread = inverse @ seen, inverse.diagonal()
+        # Savage-Dickey ratio of a unit normal weight, log p(0 | y) / p(0), negated.
         return (0.5 * (mean.square() / spread + spread.log())).float()
 
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
-        """Scorer of candidates, with the constant parts at their posterior means removed."""
+        """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
         own = Factor.of(inner)
@@ -146,11 +151,11 @@ class CandidateScorer:
         return self.root.square().sum(0).view(2, -1).mean(0)
 
     def score(self, change: Tensor) -> Tensor:
-        """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
+        """Return nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
         return self.score_positive(change)[0]
 
     def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
-        """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
+        """Return nats (m,) of adding waves (n, K), times each `share` (b, K, n) under b of m candidates."""
         scores = []
         for part in candidates.split(BLOCK):
             raise_if_cancelled()
@@ -160,15 +165,16 @@ class CandidateScorer:
         return torch.cat(scores)
 
     def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and the multiples (M,)."""
+        """Return the same, and the multiples (M,)."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
+        # A change that the constant parts take up almost wholly has no size of its own.
         multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
         return multiple * matched / 2, multiple
 
     def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
-        """Nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
+        """Return nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
         parts = [self.root @ part for part in stacked(waves)]
         seen = [self.projection @ part for part in parts]
         dot = [

@@ -46,7 +46,7 @@ SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's o
 
 
 def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
-    """The scene with clutter, or unchanged when the likelihood gains too little.
+    """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
     G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `late`, what was

@@ -46,7 +46,7 @@ class Paths:
         return self.points[:, :, 1:]
 
     def take(self, sequences: Tensor | list[int]) -> Paths:
-        """Of some sequences."""
+        """Return the paths of some sequences."""
         return Paths(self.points[sequences], self.plane[sequences], self.valid[sequences])
 
 
@@ -90,7 +90,7 @@ class Unfolding:
         self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).permute(1, 2, 3, 0)
 
     def paths(self, places: Tensor) -> Paths:
-        """From places (n, 3) [m]."""
+        """Return the paths from places (n, 3) [m]."""
         shape = (*self.present.shape[:2], len(places))
         here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.present.expand(shape)
         points = [here]

@@ -50,7 +50,7 @@ class Mirrors:
 
     @staticmethod
     def of(walls: SceneWalls, origin: np.ndarray) -> Mirrors:
-        """Faces of one plane are joined; those that touch each other make one rectangle around them.
+        """Join faces of one plane; those that touch each other make one rectangle around them.
 
         Args:
             walls: of a file.
@@ -75,7 +75,7 @@ class Mirrors:
         return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
 
     def mirroring(self, smallest: float) -> list[int]:
-        """Numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
+        """Return numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
 
         Others only block.
         """
@@ -87,13 +87,13 @@ class Mirrors:
         return sorted(size, key=lambda plane: -size[plane])
 
     def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Paths:
-        """From places (n, 3) to the transmitter (3,) float64 [m]."""
+        """Return the paths from places (n, 3) to the transmitter (3,) float64 [m]."""
         return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
     def visible_sequences(
         self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool
     ) -> tuple[Reflections, ...]:
-        """At most `most` sequences, the static end's own first, then by power expected at the places.
+        """Return at most `most` sequences, the static end's own first, then by power expected at the places.
 
         Args:
             indices: planes that mirror, the largest first.
@@ -129,7 +129,7 @@ class Mirrors:
         return ((), *(sequences[i] for i in best[: most - 1].tolist()))
 
     def hiding(self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor) -> Clutter:
-        """The rectangles that sequences are mirrored in or that hide one from a place, and the boxes."""
+        """Return the rectangles that mirror sequences or that hide one from a place, and the boxes."""
         clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
         used = {index for sequence in sequences for index in sequence}
         numbers = []
@@ -145,6 +145,7 @@ class Mirrors:
         self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
     ) -> Tensor:
         """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
+        # [m]: a place at an image would outweigh all others.
         away = torch.cdist(images(transmitter, self.planes, sequences), places).clamp_min(0.1)
         order = torch.tensor([len(sequence) for sequence in sequences])
         power = away.square().reciprocal()
@@ -168,7 +169,7 @@ class Mirrors:
 
 
 def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
-    """Walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
+    """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
@@ -209,7 +210,7 @@ def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def affordable(mirrors: int, length: int) -> int:
-    """How many mirrors, at most `mirrors`, have at most `MOST_SEQUENCES` sequences of so many reflections."""
+    """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
         count -= 1

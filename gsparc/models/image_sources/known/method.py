@@ -115,7 +115,7 @@ class KnownWallsGP(ImageSourceGP):
 def walls_cost(
     known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
 ) -> Tensor:
-    """Negative log prior [nats]: planes (P, 4) about the known ones, amplitudes (K,) about a law."""
+    """Return the negative log prior [nats]: planes (P, 4) about those known, amplitudes (K,) about a law."""
     normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
     moved = (planes[:, 3] - known[:, 3]).square().sum() / MOVED_M**2
     turned = (normal - known[:, :3]).square().sum() / TURNED**2

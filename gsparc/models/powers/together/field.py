@@ -68,7 +68,7 @@ class JointPowerField(ClosedForm):
 
     @classmethod
     def of(cls, site: Site, places: np.ndarray, own: Own, terms: Terms) -> JointPowerField:
-        """One of known settings whose stations share `terms`, to be conditioned."""
+        """Return one of known settings whose stations share `terms`, to be conditioned."""
         result = cls()
         result.site, result.places, result.own = site, places, own
         result.heard = result.unheard = terms
@@ -174,7 +174,7 @@ class JointPowerField(ClosedForm):
 
     @torch.no_grad()
     def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
+        """Return levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
 
         Args:
             moving: (G, k, 3) places of the moving end [m].
@@ -297,5 +297,5 @@ class JointPowerField(ClosedForm):
 
 
 def most_each(stations: int) -> int:
-    """Rows of each station whose factors fit into memory together."""
+    """Return rows of each station whose factors fit into memory together."""
     return min(MOST_EACH, int(math.sqrt(MEMORY / 8 / stations)))

@@ -78,11 +78,11 @@ class Own:
     heard: Mapping[int, Prior]
 
     def prior(self, number: int) -> Prior:
-        """That of a station."""
+        """Return that of a station."""
         return self.heard.get(number, self.never)
 
     def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
-        """What rows say; pseudo-values of silent ones follow from their own station's."""
+        """Return what rows say; pseudo-values of silent ones follow from their own station's."""
         result = {}
         for number in rows.stations:
             prior, part = self.prior(number), rows.of(number)
@@ -109,7 +109,7 @@ def _trend(prior: Prior) -> Trend:
 
 
 def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
-    """The law and settings of own processes, and what must be said of them.
+    """Return the law and settings of own processes, and what must be said of them.
 
     Searches end with what they have when the budget is over; single stations then have no settings of
     their own.
@@ -182,7 +182,7 @@ def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 def learn_strength(
     rows: LinkRows, own: Own, seed: int, budget: TimeBudget | None = None
 ) -> tuple[Terms, float, Gain | None]:
-    """Shared terms for stations that were never heard, of least squared error at left-out stations.
+    """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.

@@ -48,7 +48,7 @@ STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
 def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
-    """The sectors that stations are; None where neither beams are known, nor lists of sites with several.
+    """Return the sectors that stations are; None without known beams or lists of sites with several.
 
     Args:
         data: powers of several stations.
@@ -82,7 +82,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
 
 
 def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
-    """The same by sites; places (n, 7) say which station a row is of."""
+    """Return the same by sites; places (n, 7) say which station a row is of."""
     places = np.concatenate([rows.places[:, :6], rows.station[:, None]], 1)
     return replace(rows, places=places, station=network.site.numpy()[rows.station])
 
@@ -90,7 +90,7 @@ def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
 def learn_network(
     rows: LinkRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
 ) -> tuple[Prior, list[str]]:
-    """The prior of every site of a network, and what must be said of it.
+    """Return the prior of every site of a network, and what must be said of it.
 
     Args:
         rows: by sites, see `by_site`.

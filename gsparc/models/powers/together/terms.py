@@ -46,16 +46,17 @@ class LinkRows(Rows):
         return [int(number) for number in np.unique(self.station)]
 
     def of(self, number: int) -> LinkRows:
-        """The rows of one station."""
+        """Return the rows of one station."""
         return self.at(np.flatnonzero(self.station == number))
 
     def thinned(self, each: int, seed: int) -> LinkRows:
-        """At most so many rows of each station, at places that they share where they do.
+        """Return at most so many rows of each station, at places that they share where they do.
 
         Rows where something was heard come first where there are too many, up to half of them.
         """
         _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
         place = place.reshape(-1)
+        # One rank for a place: stations that share places keep the same ones.
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
         chosen = []
         for number in self.stations:
@@ -70,7 +71,7 @@ class LinkRows(Rows):
 
 
 def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
+    """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
     assert site.stations is not None and data.station is not None
     places = np.array(site.stations.position, np.float64)
@@ -85,7 +86,7 @@ def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[s
 
 
 def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkRows:
-    """Rows (n,) of stations that stand at `places` (T, 3) [m]."""
+    """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
     assert data.station is not None
     station = data.station[rows].astype(np.int64)
     seen = rows_of(data, rows)
@@ -114,24 +115,25 @@ class Terms:
 
     @classmethod
     def over(cls, rows: LinkRows, trend: Trend, length: float, places: int, seed: int) -> Terms:
-        """With g of 0 dB, known at so many places of rows, drawn evenly."""
+        """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
         none = torch.zeros(0, 3, dtype=torch.float64)
         bare = cls(trend, float(decades.min()), float(decades.max()), none, length)
         return bare.known_at(rows, places, seed)
 
     def known_at(self, rows: LinkRows, most: int, seed: int) -> Terms:
-        """The same with g known at so many places of rows, drawn evenly."""
+        """Return the same with g known at so many places of rows, drawn evenly."""
         every = np.unique(rows.places[:, :3], axis=0)
         order = np.random.default_rng(seed).permutation(len(every))[:most]
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
-        """(n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
+        """Return (n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
         if isinstance(self.trend, Sectors):
             return places.new_zeros(len(places), 0)  # each site has its own
         decades = _decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
+        # Beyond what was heard the parabola goes on as its tangent.
         bend = inside.square() + 2 * inside * (decades - inside)
         law = torch.stack([decades, bend], 1) * torch.tensor(LAW_DB, dtype=torch.float64)
         if not self.place_db:
@@ -142,11 +144,12 @@ class Terms:
     @cached_property
     def _factor(self) -> Factor:
         gram = matern32(apart(self.inducing, self.inducing), self.length)
+        # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
         return Factor.of(gram, "raise")
 
     def state(self) -> dict[str, Any]:
-        """Tensors and numbers that it is made of, but for the trend."""
+        """Return tensors and numbers that it is made of, but for the trend."""
         return {name: value for name, value in vars(self).items() if name not in ("trend", "_factor")}
 
 
