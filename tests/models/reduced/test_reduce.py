@@ -150,6 +150,7 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     assert case.away(silent) < 1e-9 and case.answer(silent).variance is None
     one = case.less(searches=1)
     assert len(one.members) == 1 and case.answer(one).variance is not None
+    assert float(one.weights.sum()) == pytest.approx(1)
     few = case.less(keep=0.3)
     assert 1 <= few.size() <= case.method.size() and torch.isfinite(case.answer(few).mean).all()
 
