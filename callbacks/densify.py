@@ -21,6 +21,7 @@ from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
 
+LEAST = 1e-7  # of an opacity, and of what lacks it to 1: logits of both are finite in float32
 MOST_CHANGE = 1e-3  # root mean square, that an edit may make of spectra whose emissions were solved for
 
 
@@ -152,7 +153,9 @@ class Densify(Checked, L.Callback):
         if in_place:
             # N layers of opacity b let through (1 - b)^N, which is to be 1 - a of the parent.
             apart = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
-            return edit.Edit(~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart)})
+            return edit.Edit(
+                ~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart, LEAST)}
+            )
         # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al., 3D Gaussian splatting (2023).
         smaller = gaussians.log_scales[splits] - math.log(0.8 * self.children)
         scales = torch.cat([gaussians.log_scales[clones], smaller])

@@ -5,7 +5,7 @@ import pytest
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import area, read_walls
-from gsparc.simulate.scenes.receivers import Layout, place, receivers
+from gsparc.simulate.scenes.receivers import Layout, neighbours, place, receivers, spread
 from gsparc.simulate.scenes.solid import box, write_mesh
 from gsparc.simulate.scenes.transmitters import stations
 
@@ -141,3 +141,11 @@ def test_mesh_is_read_back_as_walls(tmp_path):
     corners = np.unique(np.concatenate(walls.faces), axis=0)
     assert len(corners) == 8
     np.testing.assert_allclose(np.sort(corners, 0), np.sort(solid.vertices, 0), atol=6e-4)
+
+
+def test_places_that_repeat_were_drawn_again_and_neighbours_of_themselves():
+    """Probes of a receiver that stands still were also those that their effects were verified on."""
+    places = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [5, 0, 0]])
+    assert sorted(spread(places, 4, seed=0)) == [0, 1, 2, 3]
+    rows = np.arange(3)
+    assert (neighbours(places, rows) != rows).all()

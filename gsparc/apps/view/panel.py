@@ -64,7 +64,13 @@ def draw_answer(axis: Any, answer: Answer, site: Site, known: Usual | None, unit
 def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> None:
     label = f"received power [{unit}]"
     if known is None or not len(known.level_db) or answer.level_db is None:
-        axis.errorbar([0], [answer.level_db or np.nan], [answer.spread_db or 0.0], fmt="o", color=RED)
+        axis.errorbar(
+            [0],
+            [np.nan if answer.level_db is None else answer.level_db],
+            [answer.spread_db or 0.0],
+            fmt="o",
+            color=RED,
+        )
         axis.set(xticks=[], ylabel=label)
         return
     ends = list(answer.ends.values())

@@ -127,7 +127,8 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
         if not by.any() or budget.limited:
-            return replace(report, notes=(note, *report.notes))
+            limited = less_repeatable(report.limited_by, budget.limited_by)
+            return replace(report, notes=(note, *report.notes), limited_by=limited)
         limited, spent = report.limited_by, budget.counted.wall
         rest = replace(context, budget_s=budget.left_s)
         report = self._solve(parts, init, displaced(data, rows, by), fold, rest)

@@ -297,6 +297,7 @@ def spread(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
         chosen.append(int(distance.argmax()))
         # To the nearest of those chosen so far.
         distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+        distance[chosen] = -1.0  # where places repeat, another row of one of them comes next
     return np.array(chosen)
 
 
@@ -306,4 +307,6 @@ def neighbours(positions: np.ndarray, rows: np.ndarray) -> np.ndarray:
     >>> neighbours(np.array([[0.0], [1.0], [9.0]]), rows=np.array([2]))
     array([1])
     """
-    return cKDTree(positions).query(positions[rows], k=2)[1][:, 1]
+    nearest = cKDTree(positions).query(positions[rows], k=2)[1]
+    # Of two rows at one place either may come first.
+    return np.where(nearest[:, 0] == rows, nearest[:, 1], nearest[:, 0])
