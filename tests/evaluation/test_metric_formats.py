@@ -1,9 +1,14 @@
 """How figures of merit are shown and compared."""
 
+from typing import get_args
+
 import pytest
 
+from gsparc.data.schema import Scored
+from gsparc.evaluation.experiment import table
 from gsparc.evaluation.metric_formats import DECIDING, FIGURES, PER_SAMPLE, TABLES, lower_is_better, score_of
 from gsparc.evaluation.metrics import figure_names
+from gsparc.evaluation.report import plots
 
 OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quantiles of a figure with an entry
 
@@ -20,3 +25,10 @@ def test_every_figure_knows_which_way_is_better():
     for name in {"skill", *(name for kind in DECIDING for name in figure_names(kind))}:
         assert lower_is_better(name) == (name not in larger), name
         assert (score_of(name, 0.2) > score_of(name, 0.1)) == (name in larger), name
+
+
+def test_channels_that_are_scored_after_their_freedom_had_no_table():
+    """`gsparc compare` and reports of Wi-Fi channels ended in a KeyError."""
+    scored = set(get_args(Scored))
+    assert set(table.SECOND) == set(plots.CDFS) == scored
+    assert {DECIDING[one] for one in scored} <= set(table.SCORE)
