@@ -113,6 +113,8 @@ def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurem
         np.c_[data.moving[rows], station],
         axis=0, return_index=True, return_inverse=True, return_counts=True,
     )  # fmt: skip
+    if len(first) == len(rows):  # one packet of each: nothing to copy
+        return rows, data
     first, packet, target = rows[first], packet.reshape(-1), np.array(data.target)
     measured = np.ones_like(target[rows], bool) if data.mask is None else data.mask[rows]
     total, several = np.zeros((2, len(first), *target.shape[1:]), target.dtype)
