@@ -329,10 +329,17 @@ class RayTracer(Engine):
         return max(level, key=level.__getitem__, default=None)
 
     def has_open_sky(self, area: np.ndarray) -> bool:
-        """Tell whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
+        """Tell whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low.
+
+        Raises:
+            ValueError: nothing of the scene is in the area.
+        """
         low, top = self.box()[:, 2]
         height = self.height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
-        return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
+        known = height[np.isfinite(height)]
+        if not len(known):
+            raise ValueError(f"scene.area_m={area.tolist()}: nothing of the scene is there; say another")
+        return bool((known < (low + top) / 2).mean() > 0.05)
 
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
         import mitsuba as mi

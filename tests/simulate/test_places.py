@@ -1,10 +1,13 @@
 """Transmitters with sectors; receivers on a grid, along lines and out of files; objects as a mesh."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import area, read_walls
+from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.receivers import Layout, neighbours, place, receivers, spread
 from gsparc.simulate.scenes.solid import box, write_mesh
 from gsparc.simulate.scenes.transmitters import stations
@@ -149,3 +152,9 @@ def test_places_that_repeat_were_drawn_again_and_neighbours_of_themselves():
     assert sorted(spread(places, 4, seed=0)) == [0, 1, 2, 3]
     rows = np.arange(3)
     assert (neighbours(places, rows) != rows).all()
+
+
+def test_the_sky_over_an_area_beside_the_scene_was_the_mean_of_nothing():
+    empty = SimpleNamespace(box=lambda: np.zeros((2, 3)), height=lambda across: np.full(len(across), -np.inf))
+    with pytest.raises(ValueError, match="nothing of the scene is there"):
+        RayTracer.has_open_sky(empty, np.array([[500.0, 500.0], [600.0, 600.0]]))

@@ -6,6 +6,7 @@ import functools
 import json
 import logging
 import os
+import re
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -37,6 +38,9 @@ WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its setti
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
 NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
+STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
+REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
+DOCSTRING = re.compile(rf'(:\n\s+|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
 LIBRARIES = {"lightning", "torch"}  # named by every configuration; their versions stand in each summary
 
 
@@ -168,8 +172,9 @@ def _program(packages: tuple[str, ...]) -> str:
 def text_of(package: str) -> str:
     """Return the hash of a package's text.
 
-    In a checkout it is of what git tracks and of new files, as they are: commits that change pages or tests
-    alone change nothing. Of an installed distribution it is of its record, else of all modules in its folder.
+    In a checkout it is of what git tracks and of new files, as they are: commits that change pages, tests,
+    comments or docstrings alone change nothing. Of an installed distribution it is of its record, else of all
+    modules in its folder.
     """
     spec = find_spec(package)
     if spec is None:
@@ -186,6 +191,18 @@ def text_of(package: str) -> str:
         if any(file.parts[0] == package for file in one.files or ()):
             return sha256(str(one.read_text("RECORD")).encode()).hexdigest()
     return _of_files(folder, [str(file.relative_to(folder)) for file in folder.rglob("*.py")])
+
+
+def code_of(text: str) -> str:
+    """Return Python without comments and empty lines, and with empty docstrings.
+
+    By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
+
+    >>> code_of("mark = '#'  # of a comment")
+    "mark = '#'"
+    """
+    code = REMARK.sub(lambda one: one[1] or "", text)
+    return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
 
 
 def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
@@ -216,6 +233,9 @@ def _of_files(root: Path, files: Iterable[str]) -> str:
 
 
 def _content_of(file: str | Path) -> str:
+    """The hash of a file, of Python of what it does."""
+    if Path(file).suffix == ".py":
+        return sha256(code_of(Path(file).read_text(encoding="utf-8", errors="replace")).encode()).hexdigest()
     with open(file, "rb") as stream:
         return file_digest(stream, "sha256").hexdigest()
 

@@ -47,10 +47,9 @@ class SweepReport(Callback):
         folder = Path(config.hydra.runtime.output_dir)
         # The mark that `on_multirun_end` counts failures by: other processes' jobs are seen as files alone.
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
-        log.error("failed", exc_info=error)  # the job's own log keeps the traceback
         said = " ".join(config.hydra.overrides.task)
-        text = f"job {folder.name} ({said}) failed, others go on: {message}"
-        Console(stderr=True, soft_wrap=True).print(text, style="red", markup=False, highlight=False)
+        # The console shows the sentence, the job's own log the traceback, too.
+        log.error("job %s (%s) failed, others go on: %s", folder.name, said, message, exc_info=error)
         # Hydra raises the first failed job's error and ends the sweep: it is told that the job ended well.
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None

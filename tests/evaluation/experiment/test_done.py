@@ -1,5 +1,6 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from gsparc.evaluation.experiment.done import (
     FAILURE,
     State,
     _checkout,
+    code_of,
     content,
     finished,
     once,
@@ -160,6 +162,17 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     assert State.unread(compose("dataset=rfid", "dataset.root=null", "model=mean")) is None
 
 
+def test_commits_of_comments_alone_made_every_cell_stale():
+    """What is hashed of a file differs from it in comments, empty lines and docstrings alone."""
+    for file in sorted(Path(gsparc.__file__).parent.rglob("*.py"))[::12]:
+        tree = ast.parse(text := file.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+                node.body[0].value.value = ""
+        assert ast.dump(ast.parse(code_of(text))) == ast.dump(tree), file
+    assert code_of("x = 1  # one\n") == code_of("x = 1\n") != code_of("x = 2\n")
+
+
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     walls, states = tmp_path / "walls.yaml", []
     for text in ("[]", "[1]"):
@@ -189,4 +202,8 @@ def test_cells_were_current_whose_method_s_own_files_had_changed(tmp_path, monke
     assert len(set(hashes)) == 4
     page.write_text("other words")
     assert text_of("toy_program") == hashes[-1]
+    module.write_text('"""Of a value."""\n\nVALUE = 2  # in metres\n')
+    commented = text_of("toy_program")
+    module.write_text('"""Of another."""\nVALUE = 2\n')
+    assert text_of("toy_program") == commented
     sys.modules.pop("toy_program", None)

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
+from gsparc.evaluation.console import Screen
 from gsparc.evaluation.report.sweep import FAILURE, SweepReport
 
 ROOT = Path(__file__).parents[3]
@@ -29,13 +31,16 @@ def failed(error: Exception) -> JobReturn:
     return job
 
 
-def test_a_failure_is_said_and_kept_and_the_sweep_goes_on(tmp_path, capsys):
-    job = failed(ValueError("no such file\nsecond line"))
+def test_a_failure_is_said_once_and_kept_and_the_sweep_goes_on(tmp_path, caplog):
+    job, shown = failed(ValueError("no such file\nsecond line")), StringIO()
     SweepReport().on_job_end(of_job(tmp_path), job)
     assert job.status == JobStatus.COMPLETED and job.return_value is None
     assert (tmp_path / FAILURE).read_text() == "no such file\n"
-    said = capsys.readouterr().err
-    assert f"job {tmp_path.name} (seed=3) failed, others go on: no such file" in said.replace("\n", " ")
+    screen = Screen(stream=shown)
+    for record in caplog.records:
+        screen.handle(record)
+    assert shown.getvalue() == f"error: job {tmp_path.name} (seed=3) failed, others go on: no such file\n"
+    assert "second line" in caplog.text  # in the job's own log
 
 
 def test_a_single_run_and_a_good_job_are_left_alone(tmp_path):
@@ -97,7 +102,8 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
-    assert done.stderr.count("failed, others go on") == 1 and "1 jobs failed" in done.stdout
+    assert done.stdout.count("failed, others go on") == 1 and "error: failed" not in done.stdout
+    assert "1 jobs failed" in done.stdout
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
-    assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stderr)
+    assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stdout)
     assert (sweep / "sweep.csv").read_text().count("\n") == 2
