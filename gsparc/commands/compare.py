@@ -25,7 +25,7 @@ from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.places import compare_places, facts_and_table
 from gsparc.evaluation.experiment.problem import named, problems_of
-from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, overview, rows_of
+from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 
@@ -90,7 +90,7 @@ def report(
     blocks = blocks_of(rows)
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
-    page = "\n\n".join([*map(overview, by_set), markdown(blocks, ours)])
+    page = markdown(blocks, ours)
     write_samples(run_dir / "compare.csv", rows.to_dict("list"))
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")

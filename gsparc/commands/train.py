@@ -23,9 +23,9 @@ from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
 from gsparc.data.files import SUMMARY, is_address, set_aside
-from gsparc.data.instantiate import find, node_of, suggest
+from gsparc.data.instantiate import find, node_of
 from gsparc.data.load import datamodule, split_for
-from gsparc.data.schema import Measurements, Scored
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
@@ -36,7 +36,6 @@ from gsparc.evaluation.experiment.done import State, content, finished, once, pr
 from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
-from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_of
@@ -223,9 +222,8 @@ def _check(
     """Refuse now what would be found after the training.
 
     Raises:
-        ValueError: an objective, a file of walls, a split or a resume that cannot be.
+        ValueError: a file of walls, a split or a resume that cannot be.
     """
-    objective_of(config, data.site.scored)
     _known_walls(config)
     split.check()  # none without rows to learn from or to test on
     if any(resumes) and not method.resumable and not Path(config.ckpt_path).is_dir():  # of finished parts
@@ -330,26 +328,12 @@ def _draw(
         tracking.picture(loggers, "found", run_dir / "found.png")
 
 
-def objective_of(config: DictConfig, kind: Scored) -> str:
-    """Return the figure of rows `eval_on` that a search improves; `objective: null`: the deciding one.
-
-    Raises:
-        ValueError: there is no such figure.
-    """
-    figures = [DECIDING[kind], *figure_names(kind), "skill"]
-    known = {f"{config.eval_on}/{figure}": figure for figure in figures}
-    objective = config.get("objective")
-    if objective is not None and objective not in known:
-        raise ValueError(f"objective={objective}: no such figure{suggest(str(objective), known)}")
-    return DECIDING[kind] if objective is None else known[objective]
-
-
 def task(config: DictConfig) -> float:
     """Train as configured and show the table; a job of a multirun is done once, see `once`.
 
     Returns:
-        The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned; NaN
-            where the data do not tell it and no search asks.
+        The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
+            NaN where the data do not tell it and no search asks.
     """
     hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
     if config.ckpt_path is not None:
@@ -365,13 +349,13 @@ def task(config: DictConfig) -> float:
             state = State.of(config, content(begun.module.measurements), begun.split.sha256)
             work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
             facts = once(run_dir, state, work, unread=unread, **how)
-    figure = objective_of(config, facts["dataset/kind"])
+    figure = DECIDING[facts["dataset/kind"]]
     value = facts[f"{config.eval_on}/{figure}"]
     if value is not None:
         return score_of(figure, value)
     # A search cannot rank a job without its figure; a plain multirun can do without.
     if job and hydra.runtime.choices["hydra/sweeper"] != "basic":
-        raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")
+        raise ValueError(f"{config.eval_on}/{figure}: these data do not tell what the search improves")
     return math.nan  # only a search asks for it
 
 

@@ -265,20 +265,6 @@ def metrics_for(kind: Scored, scale: float = 1.0) -> SampleMetric:
     return METRICS[kind](scale)
 
 
-def figure_names(kind: Scored) -> tuple[str, ...]:
-    """Return the figures of merit that a dataset kind is told by.
-
-    >>> figure_names("rssi")
-    ('rmse_db', 'mae_db', 'nmse', 'mse')
-    """
-    shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
-    one = torch.ones(shape, dtype=torch.complex64 if kind.endswith("csi") else torch.float32)
-    metric = metrics_for(kind)
-    metric.update(one, one)
-    counts = ("samples", "silent_samples")
-    return tuple(name for name in metric.summary(metric.compute()) if name not in counts)
-
-
 def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return per-sample values whose means are the flat figures, so that their differences can be paired.
 

@@ -22,15 +22,13 @@ from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
-from gsparc.commands.train import Objects, main, objective_of, train
+from gsparc.commands.train import Objects, main, train
 from gsparc.data.datamodule import Loaded
 from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.metric_formats import DECIDING
-from gsparc.evaluation.metrics import figure_names
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.fitting import Origin
@@ -338,7 +336,6 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
         (["init_from={model}", "dataset.file={csi}"], "init_from=.*trained with kind spectrum"),
         (["init_from={model}", "dataset.file={far}"], "init_from=.*from the model's"),
         (["init_from={model}", "model=nearest"], "init_from: nearest takes no weights to start from"),
-        (["objective=test/psnr"], "did you mean 'test/psnr_db'"),
         (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
     ],
 )
@@ -418,20 +415,6 @@ def test_a_method_without_a_field_has_no_module(others):
 
 
 # -- the objective of a search --------------------------------------------------------------------------
-
-
-def test_the_objective_is_a_figure_of_the_kind():
-    config = compose("eval_on=val")
-    for kind in KINDS:
-        config.objective = None
-        assert objective_of(config, kind) == DECIDING[kind] and DECIDING[kind] in figure_names(kind)
-        for figure in (*figure_names(kind), "skill"):
-            config.objective = f"val/{figure}"
-            assert objective_of(config, kind) == figure
-        config.objective = "val/nmsee"
-        said = r"objective=val/nmsee: no such figure; did you mean 'val/nmse'\?"
-        with pytest.raises(ValueError, match=said):
-            objective_of(config, kind)
 
 
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])

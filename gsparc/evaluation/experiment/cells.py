@@ -19,7 +19,7 @@ class Contender:
 
     Attributes:
         name: in tables.
-        choose: overrides of train.yaml that select it.
+        choose: overrides of train.yaml that select it; empty: `model=<name>`.
         budget: overrides with `{budget_s}`; empty when its time cannot be chosen.
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
@@ -28,7 +28,7 @@ class Contender:
     """
 
     name: str
-    choose: tuple[str, ...]
+    choose: tuple[str, ...] = ()
     budget: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
     stations: bool = False
@@ -44,7 +44,7 @@ class Contender:
     def overrides(self, budget_s: float | None) -> list[str]:
         """Overrides of train.yaml, but for the seed."""
         timed = [] if budget_s is None else [text.format(budget_s=f"{budget_s:g}") for text in self.budget]
-        return [*self.choose, *timed]
+        return [*(self.choose or (f"model={self.name}",)), *timed]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def plugged() -> dict[str, Contender]:
         kind = find(path)
         if name not in methods() and kind is not None:  # one that cannot be imported is warned of
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
+            found[name] = Contender(name, (), budget, tuple(getattr(kind, "kinds", ())))
     return found
 
 

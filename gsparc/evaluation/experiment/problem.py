@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from inspect import signature
 from typing import Any, TypeVar
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.instantiate import from_settings
 from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import found
 from gsparc.data.schema import Measurements, Scored
@@ -92,23 +92,16 @@ class Problem:
         return names_scene(self.data.provenance)
 
 
-def named(group: str, of: Callable[..., Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
+def named(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
     """Return named settings of conf/compare.yaml, `methods` or `splits`; an empty entry has defaults.
 
     Raises:
-        ValueError: an entry with an unknown setting, or without one that is needed.
+        ValueError: an entry with an unknown setting.
     """
-    # The dataclass is the only list of settings: a new field needs no second entry.
-    known, entries = [name for name in signature(of).parameters if name != "name"], {}
+    entries = {}
     for name, entry in config.items():
         own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
-        if unknown := sorted(set(own) - set(known)):
-            raise ValueError(f"{group}.{name}: unknown {unknown[0]!r}; there are {', '.join(known)}")
-        try:
-            entries[str(name)] = of(name=str(name), **own)
-        except TypeError as error:
-            # Python's words, less the name of the class that nobody typed.
-            raise ValueError(f"{group}.{name}: {str(error).partition('() ')[2]}") from None
+        entries[str(name)] = from_settings(of, {"name": str(name), **own}, f"{group}.{name}")
     return entries
 
 

@@ -13,7 +13,6 @@ import pandas as pd
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.metric_formats import heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, markdown_table, shown
 
@@ -238,37 +237,6 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
         ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
     )  # fmt: skip
     return columns | {head: column(name, form) for name, head, form in costs}
-
-
-def overview(rows: pd.DataFrame) -> str:
-    """Markdown: the figure ± its standard error of the mean, (how far behind the best of the same draws).
-
-    The best of a split is bold, and so is whatever is within two standard errors of it. Seconds of one fit
-    and milliseconds of one query are those of the first split. Rows are of one dataset and of drawn splits.
-    """
-    splits = list(rows.split.unique())
-    lines = []
-    for name in by_mean_behind(rows):
-        own = {row.split: row for row in rows.itertuples() if row.method == name}
-        first = next(iter(own.values()))
-        cells = [_cell(own[split]) if split in own else "-" for split in splits]
-        lines.append([name, *cells, f"{first.train_s:.2g}", shown(first.query_ms, ".2g")])
-    figure = heading_of(rows.figure.iloc[0]).replace(" dB", ", dB")
-    title = f"### {rows.dataset.iloc[0]}: {figure}, {rows.seeds.max()} draws of each split"
-    table = markdown_table(["method", *splits, "fit s", "query ms"], lines, numbers=True)
-    return "\n".join([title, "", *table])
-
-
-def _cell(row: Any) -> str:
-    form = ".3f" if row.figure.startswith("nmse") else ".2f"
-    value = f"{row.value:{form}}"
-    if not np.isnan(row.value_error):
-        value += f" ± {row.value_error:{form}}"
-    behind, error = np.nan_to_num([row.behind_db, row.behind_error_db])
-    # Two standard errors of the paired difference: not told from the best.
-    if behind <= 2 * error:
-        value = f"**{value}**"
-    return value if behind == 0 else f"{value} ({behind:.2f} ± {error:.2f} dB)"
 
 
 def by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:

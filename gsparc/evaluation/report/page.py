@@ -59,7 +59,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
-    makers = (tables.results, tables.within_minutes, tables.costs, tables.effects, tables.worst)
+    makers = (tables.results, tables.within_minutes, tables.effects, tables.worst)
     study.tables += [table for table in (make(runs) for make in makers) if table.rows]
     drawn = plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.learning(runs)
     study.plots = [

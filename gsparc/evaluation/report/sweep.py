@@ -5,21 +5,18 @@ from __future__ import annotations
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.table import Table as Shown
+from rich.markdown import Markdown
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
 from gsparc.evaluation.experiment.done import FAILURE
-
-if TYPE_CHECKING:  # every training imports this module; pandas takes half a second
-    from gsparc.evaluation.report.table import Column, Table
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +67,7 @@ class SweepReport(Callback):
 
 def report(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
-    from gsparc.evaluation.report import plots
+    from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import studies, write
     from gsparc.evaluation.report.runs import by_study, distinct_overrides, find_runs, retime
     from gsparc.evaluation.report.tables import seeds
@@ -88,27 +85,9 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
         plots.distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
-        console.print(_on_screen(table))
+        console.print(Markdown(table.without(*WIDE).markdown()))
         for row in table.rows:
             for column, value in zip(table.columns[1:], row[1:], strict=True):
                 facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)
     summary.write_summary(folder / "summary.json", facts)
     console.print(f"written to {folder}", highlight=False)
-
-
-def _on_screen(table: Table) -> Shown:
-    """What fits a terminal; the files have the rest."""
-    table = table.without(*WIDE)
-    first, *others = (column.name for column in table.columns)
-    rows = (list(map(_spread, row, table.columns)) for row in table.rows)
-    screen = summary.table(table.title, [first], others, rows)
-    screen.caption = "least to largest over seeds; sweep.csv has more"
-    return screen
-
-
-def _spread(value: Any, column: Column) -> str:
-    low, high = (getattr(value, end, None) for end in ("low", "high"))
-    if low is None or high is None:
-        return column.text(value)
-    low, high = format(low, column.form), format(high, column.form)
-    return low if low == high else f"{low} to {high}"

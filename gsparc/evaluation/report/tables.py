@@ -14,7 +14,7 @@ from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, headin
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import Column, Interval, Row, Table, interval, over_seeds
 
-WORST, LEVELS = 3, 3
+WORST = 3
 SETTING = Column("method and setting", of="setting")
 SEED = Column("seed", "d", of="seed")
 TRAIN = Column("train s", ".3g", of="train_s")
@@ -37,11 +37,13 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 
 def results(runs: Sequence[Run]) -> Table:
-    """Every run and every baseline of one study: accuracy, time, memory, size, effects, data and commit."""
+    """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
     columns = [
         SETTING, SEED,
         *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].row["kind"]]),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
+        Column("points measured", "d", of="measured"),
+        Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
         Column("memory MB", ".0f", of="memory_mb"), SIZE, Column("effects", of="effects"),
         Column("load", ".2f", "1-minute load per core while measured", "load"),
         Column("data", of=lambda row: str(row["data"])[:8]),
@@ -100,17 +102,6 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
     }
 
 
-def costs(runs: Sequence[Run]) -> Table:
-    """Total costs: measurements, simulation, training and query time."""
-    columns = [
-        SETTING, SEED, Column("points measured", "d", of="measured"),
-        Column("seconds simulated", ".3g", of="simulate_s"), Column("seconds trained", ".3g", of=TRAIN.of),
-        Column("ms a query", ".3g", of=P50.of), accuracy(runs[0].row["figure"]),
-    ]  # fmt: skip
-    note = "Seconds simulated: of the ray tracer that made the data; none where they were measured."
-    return Table.of("Total costs", columns, (run.row for run in runs), note)
-
-
 def worst(runs: Sequence[Run]) -> Table:
     """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
@@ -137,7 +128,7 @@ MINUTES = (1, 2, 5, 10)
 
 
 def within_minutes(runs: Sequence[Run]) -> Table:
-    """Return the best validation figures within fixed training times, and the times to fixed figures."""
+    """Return the best validation figures within fixed training times."""
     figure = validation_figure(runs[0])
     score = partial(score_of, figure)
 
@@ -146,16 +137,10 @@ def within_minutes(runs: Sequence[Run]) -> Table:
         # Not NumPy's `max`: of some figures the smaller is the better.
         return max(values[seconds <= 60 * minutes], key=score, default=None)
 
-    def seconds_to(row: Row, level: float) -> float | None:
-        seconds, values = curve(row["run"])
-        good = [s for s, v in zip(seconds, values, strict=True) if score(v) >= score(level)]
-        return good[0] if good else None
-
     head, form = heading_of(figure), form_of(figure)
     columns = [
         SETTING, SEED,
         *(Column(f"{head} within {m} min", form, of=partial(best_within, minutes=m)) for m in MINUTES),
-        *(Column(f"s to {v:.4g}", ".3g", of=partial(seconds_to, level=v)) for v in levels(runs)),
         Column("train s in all", ".3g", of=TRAIN.of),
     ]  # fmt: skip
     note = (
@@ -183,21 +168,6 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
     if end is None or value is None:
         return np.zeros(0), np.zeros(0)
     return np.array([end]), np.array([value])
-
-
-def levels(runs: Sequence[Run]) -> list[float]:
-    """Round figures between what the worst and the best run reach, the worst first."""
-    score = partial(score_of, validation_figure(runs[0]))
-    ends = [max(curve(run)[1], key=score) for run in runs if len(curve(run)[0])]
-    if not ends:
-        return []
-    worst, best = min(ends, key=score), max(ends, key=score)
-    # Equal up to rounding: one level is all there is between them.
-    if abs(best - worst) < 1e-9 * max(abs(best), 1e-9):
-        return [float(f"{worst:.3g}")]
-    # Three digits: round figures are read, and repeat over runs.
-    between = {float(f"{v:.3g}") for v in np.linspace(worst, best, LEVELS + 2)[:-1]}
-    return sorted(between, key=score)[:LEVELS]
 
 
 def effects(runs: Sequence[Run]) -> Table:

@@ -80,9 +80,8 @@ def test_every_method_of_the_default_comparison_composes():
 
 
 @pytest.mark.parametrize(("group", "of", "entry", "message"), [
-    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x: unknown 'chose'; there are choose"),
-    ("methods", Contender, {}, r"methods\.x: missing 1 required positional argument: 'choose'"),
-    ("splits", SplitChoice, {"draw": 3}, r"splits\.x: unknown 'draw'; there are choose, datasets, draws"),
+    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are budget"),
+    ("splits", SplitChoice, {"draw": 3}, r"splits\.x\.draw: no such setting; there are choose, datasets"),
 ])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
