@@ -39,8 +39,8 @@ def campaign(config: DictConfig) -> Campaign:
     return Campaign(
         scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
         SpectrumSettings(**settings["spectrum"]), ArraySettings(**settings["csi"]),
-        shard=int(settings["shard"]), check=int(settings["check"]), check_seed=int(settings["check_seed"]),
-        weakest_db=float(settings["weakest_db"]), measurement=str(settings["measurement"]),
+        shard=int(settings["shard"]), check=int(settings["check"]),
+        measurement=str(settings["measurement"]),
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, reduced(method, some, measured)) for some in settings]
-    others = tradeoff.others_of(run, config.baselines, config.peers, config.ckpt, config.eval_on)
+    others = tradeoff.others_of(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score
-from gsparc.models.fitting import fit
 from gsparc.models.method import Method
-from gsparc.models.per_station import for_stations, trained_stations
+from gsparc.models.per_station import trained_stations
 from gsparc.models.registry import method_class
-from gsparc.training.context import FitContext
+from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
 
@@ -71,14 +71,15 @@ def baseline(
     """
     own, before = learned or (data, split)
     unseen = eval_on == "val" and learned is None
-    methods, seconds = [], []
-    for number, fold in enumerate(before.folds):
+
+    def known(there: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
         # Learning from `val` rows as methods do; where these are scored they must stay unseen.
-        known = replace(fold, val=fold.val[:0]) if unseen else fold
-        factory = for_stations(method_class(name)(), own)
-        method, report = fit(factory, own, known, FitContext(Path()))
+        return there, replace(fold, val=fold.val[:0]) if unseen else fold
+
+    def said(number: int, method: Method, report: FitReport) -> None:
         for note in report.notes:
             log.info("fold %d: %s", number, note)
-        methods.append(method)
-        seconds.append(report.seconds)
-    return Fitted(tuple(methods), score(methods, data, split, eval_on), tuple(seconds))
+
+    contexts = [FitContext(Path())] * len(before.folds)
+    fits = fit_folds(method_class(name)(), own, before, contexts, learned=known, keep=said)
+    return Fitted(fits.methods, score(fits.methods, data, split, eval_on), fits.train_s)

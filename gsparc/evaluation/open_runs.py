@@ -13,11 +13,12 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
 from gsparc.data.files import is_address
-from gsparc.data.load import datamodule, split_for, split_settings
+from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.experiment.folds import counted
 from gsparc.evaluation.scores import rows_of
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
@@ -81,15 +82,8 @@ class Opened:
         config = self.stored[0].configuration
         if "model" not in config:
             raise DataError(f"{self.stored[0].path} does not say how it was trained")
-        split = config.get("split")
-        own = {
-            "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
-            "budget_s": config.get("budget_s"), "budget_clock": config.get("budget_clock", "wall"),
-            "stations": config.get("stations", "auto"),
-            "split": None if split is None else split_settings(split),
-        }  # fmt: skip
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
-        factory, context = build(config["model"], trusted=False), FitContext(**own | others)
+        factory, context = build(config["model"], trusted=False), FitContext(**counted(config) | others)
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
 

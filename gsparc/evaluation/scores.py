@@ -82,18 +82,6 @@ class Scores:
         means = np.bincount(of_row, error) / np.bincount(of_row)
         return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Everything as arrays, for a file."""
-        own = {"fold": self.fold, "row": self.row, "confidence": self.confidence, "variance": self.variance}
-        return {"kind": np.array(self.kind), **own, **{f"samples/{k}": v for k, v in self.samples.items()}}
-
-    @staticmethod
-    def from_arrays(arrays: dict[str, np.ndarray]) -> Scores:
-        """Inverse of `arrays`; `KeyError` when something is missing."""
-        own = {k: arrays[k] for k in ("fold", "row", "confidence", "variance")}
-        samples = {k.removeprefix("samples/"): v for k, v in arrays.items() if k.startswith("samples/")}
-        return Scores(kind=str(arrays["kind"]), samples=samples, **own)  # type: ignore[arg-type]
-
 
 def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
     """Rows of the subset `train`, `val` or `test`.

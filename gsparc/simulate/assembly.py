@@ -22,6 +22,7 @@ from gsparc.simulate.spectrum import spectra
 from gsparc.simulate.survey import Engine, Survey
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
+WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
@@ -51,8 +52,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
     strongest = np.zeros(len(paths))
     # Unbuffered, as a receiver owns many paths.
     np.maximum.at(strongest, paths.owner, paths.power)
-    # Only what is within `weakest_db` of a receiver's strongest path goes into the file.
-    stored = paths.select(paths.power >= strongest[paths.owner] * 10 ** (-campaign.weakest_db / 10))
+    stored = paths.select(paths.power >= strongest[paths.owner] * WEAKEST)
     return {
         "spectrum": np.round(images * 255).astype(np.uint8),
         "spectrum_peak": peak,
@@ -143,21 +143,15 @@ def _arrays(
     paths: Paths,
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
-    spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
-    if campaign.spectrum.normalisation == "none":
-        for part in blocks(spectrum):
-            # A shard knew the largest value of its own rows: here all are divided by that of all.
-            spectrum[part] = np.round(spectrum[part] * (peak[part] / peak.max())[:, None, None])
+    csi = whole["csi"]
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
     tests = max(1, round(scene.test_share * len(order)))
     each = np.arange(len(survey.engines))[:, None] * len(order)  # a place is held out with all transmitters
     arrays = {
         **_ends(survey),
-        "spectrum": spectrum,
-        "spectrum_peak": peak,
         "frequency_hz": scene.frequency_hz,
         "carrier_hz": np.array(scene.carrier_hz),
-        **{name: whole[name] for name in ("received_power", "delay_spread")},
+        **{name: whole[name] for name in ("spectrum", "spectrum_peak", "received_power", "delay_spread")},
         **{f"path_{name}": getattr(paths, name) for name in STORED},
         "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
         "line_of_sight": paths.per_receiver((paths.order == 0).astype(float)) > 0,
@@ -204,7 +198,6 @@ def _provenance(campaign: Campaign, engine: Engine, effects: PropagationEffects)
     return {
         "name": campaign.scene.name,
         "measurement": campaign.measurement,
-        "normalisation": campaign.spectrum.normalisation,
         "simulator": engine.name,
         "simulator_versions": json.dumps(engine.versions()),
         "scene": json.dumps(asdict(campaign.scene)),

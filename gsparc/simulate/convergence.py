@@ -53,14 +53,12 @@ def convergence(
     # So many that enough remain when those traced otherwise are taken out.
     rows = survey.spread(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
-    again = survey.trace(rows, effects, campaign.check_seed)
-    csi, spectrum, peak, power = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak", "received_power")
+    again = survey.trace(rows, effects, campaign.sampling.seed + 1)
+    csi, spectrum, power = shards.of_rows(rows, "csi", "spectrum", "received_power")
     frequency, wavelength = campaign.scene.frequency_hz, survey.engine.wavelength
     other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)
     energy = max(float((np.abs(csi) ** 2).sum()), np.finfo(float).tiny)
-    # Each image by its own largest value, or all by the largest of these receivers.
-    share = 1.0 if campaign.spectrum.normalisation == "max" else (peak / peak.max())[:, None, None]
-    images = [spectrum / 255 * share, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
+    images = [spectrum / 255, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     twice = np.stack([power, again.received_power()])

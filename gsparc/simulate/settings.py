@@ -24,8 +24,6 @@ class Campaign:
         spectrum, csi: what is stored.
         shard: receivers per shard.
         check: receivers of the convergence error; 0 for none.
-        check_seed: the second seed.
-        weakest_db: stored paths reach this far below the strongest of their receiver [dB].
         measurement: which of `spectrum` and `csi` the file is mainly read as.
     """
 
@@ -36,8 +34,6 @@ class Campaign:
     csi: ArraySettings = field(default_factory=ArraySettings)
     shard: int = 400
     check: int = 128
-    check_seed: int = 2
-    weakest_db: float = 60.0
     measurement: str = "spectrum"
 
     def inputs(self) -> dict[str, str]:
@@ -55,6 +51,3 @@ class Campaign:
             raise ValueError(f"measurement={self.measurement}: expected spectrum or csi")
         if self.shard < 1 or self.check < 0:
             raise ValueError("shard is at least 1, check at least 0")
-        # The same seed gives the same rays, and a convergence error of 0.
-        if self.check_seed == self.sampling.seed:
-            raise ValueError("check_seed must differ from sampling.seed")

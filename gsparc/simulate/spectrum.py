@@ -17,7 +17,7 @@ from gsparc.ops import SphereGrid
 from gsparc.simulate.paths import Paths
 
 BLOCK = 64  # receivers at once
-CHOICES = {"kind": ("bartlett", "beam"), "scale": ("amplitude", "power"), "normalisation": ("max", "none")}
+KINDS = ("bartlett", "beam")
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,11 @@ class ArraySettings:
 
 @dataclass(frozen=True)
 class SpectrumSettings(ArraySettings):
-    """One definition of a spectrum, of the array of a `bartlett` one.
+    """One definition of a spectrum, of the array of a `bartlett` one; a pixel is an amplitude.
 
     Attributes:
         kind: `bartlett` or `beam`.
         beam_deg: full width at half power of the beam kernel [deg].
-        scale: what a pixel is: `power`, or `amplitude`, its square root.
-        normalisation: each image divided by its largest value (`max`), or all by the largest of all (`none`).
         height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
     """
 
@@ -59,17 +57,12 @@ class SpectrumSettings(ArraySettings):
     columns: int = 8
     kind: Literal["bartlett", "beam"] = "bartlett"
     beam_deg: float = 10.0
-    scale: Literal["amplitude", "power"] = "amplitude"
-    normalisation: Literal["max", "none"] = "max"
     height: int = 90
     width: int = 360
 
     def __post_init__(self) -> None:
-        for name, allowed in CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"spectrum.{name}={getattr(self, name)}: expected one of {', '.join(allowed)}"
-                )
+        if self.kind not in KINDS:
+            raise ValueError(f"spectrum.kind={self.kind}: expected {' or '.join(KINDS)}")
         if min(self.rows, self.columns, self.height, self.width) < 1:
             raise ValueError("spectrum: rows, columns, height and width are at least 1")
         if not (self.spacing > 0 and self.beam_deg > 0):
@@ -91,15 +84,15 @@ class SpectrumSettings(ArraySettings):
 
     def attributes(self) -> dict[str, str | float | int]:
         """Return the definition as attributes of a file."""
-        attributes = {f"spectrum_{key}": value for key, value in asdict(self).items()}
         drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")
-        return {key: value for key, value in attributes.items() if key.removeprefix("spectrum_") not in drop}
+        own = {f"spectrum_{key}": value for key, value in asdict(self).items() if key not in drop}
+        return {"normalisation": "max", "spectrum_scale": "amplitude", **own}
 
 
 def spectra(
     paths: Paths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
+    """Return spectra (R, H, W) float32, and the largest amplitude of each (R,), which it was divided by.
 
     Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
     black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.
@@ -116,9 +109,8 @@ def spectra(
         else:
             channels = some.responses(frequency_hz, elements, wavelength)
             images[rows] = bartlett(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
-    if settings.scale == "amplitude":
-        np.sqrt(images, out=images)
-    peak = images.max(axis=(1, 2)) if settings.normalisation == "max" else np.full(len(images), images.max())
+    np.sqrt(images, out=images)
+    peak = images.max(axis=(1, 2))
     peak = np.where(peak > 0, peak, 1.0).astype(np.float64)
     images /= peak[:, None, None].astype(np.float32)
     return images, peak

@@ -20,8 +20,8 @@ from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.data.schema import LIGHT
 from gsparc.evaluation.simulated import effect_shares, floor_plan
+from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
-from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
@@ -84,7 +84,7 @@ def after(calls):
 
 
 def test_file_equals_the_exact_room_and_its_paths_make_the_channel(tmp_path):
-    outcome = simulate(plan(weakest_db=200.0), tmp_path / "box.h5")
+    outcome = simulate(plan(), tmp_path / "box.h5")
     stored, about = arrays(tmp_path / "box.h5")
     room = Room(np.zeros(3), np.array([6.0, 5, 3]), np.full(6, -0.6), np.array(SCENE.room["boxes_m"]))
     exact = trace(room, SCENE.transmitter_m, stored["rx_position"], SCENE.frequency_hz, max_order=3).csi
@@ -374,8 +374,7 @@ def put_together(out: Path, receivers: int) -> int:
     """Write a file from shards whose rows are those of 20 traced places, again and again; peak memory [B]."""
     asked = plan(
         scene=replace(SCENE, num_receivers=receivers), effects=replace(MIRROR, noise_snr_db=20.0),
-        spectrum=replace(SMALL, height=45, width=90, normalisation="none"),
-        csi=ArraySettings(rows=4, columns=4), weakest_db=6.0,
+        spectrum=replace(SMALL, height=45, width=90), csi=ArraySettings(rows=4, columns=4),
     )  # fmt: skip
     survey, shards = build(asked.scene, asked.sampling), Shards(out, {"receivers": receivers})
     wavelength = survey.engine.wavelength
@@ -395,6 +394,7 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     """They were all held at once: at 100,000 receivers tens of gigabytes."""
     monkeypatch.setattr(blocks, "BIG", 2**16)
     monkeypatch.setattr(blocks, "BLOCK", 2**16)
+    monkeypatch.setattr(assembly, "WEAKEST", 0.25)
     few, many = (put_together(tmp_path / f"{n}.h5", n) for n in (100, 1000))
     stored, _ = arrays(tmp_path / "1000.h5")
     row = stored["spectrum"][0].nbytes + stored["csi"][0].nbytes

@@ -35,15 +35,9 @@ def context_of(config: DictConfig, **others: Any) -> FitContext:
         config: its seed, effort, budget, split, `init_from`, batch size, Trainer and callbacks.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
-    init_from, split = config.get("init_from"), config.get("split")
+    init_from = config.get("init_from")
     return FitContext(
-        seed=int(config.seed),
-        # `get`: configurations of other commands, and older ones, lack some of these keys.
-        effort=float(config.get("effort", 1.0)),
-        budget_s=config.budget_s,
-        budget_clock=config.get("budget_clock", "wall"),
-        stations=config.get("stations", "auto"),
-        split=None if split is None else split_settings(plain(split)),
+        **counted(config),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
         trainer=instantiate(config.trainer, _partial_=True),
@@ -51,6 +45,18 @@ def context_of(config: DictConfig, **others: Any) -> FitContext:
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
         **others,
     )
+
+
+def counted(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a context decides how much is searched, and on which rows; it makes no object."""
+    split = config.get("split")
+    own = split if split is None or isinstance(split, dict) else plain(split)
+    return {
+        # `get`: configurations of other commands, and older ones, lack some of these keys.
+        "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
+        "budget_s": config.get("budget_s"), "budget_clock": config.get("budget_clock", "wall"),
+        "stations": config.get("stations", "auto"), "split": own and split_settings(own),
+    }  # fmt: skip
 
 
 def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:
@@ -67,7 +73,6 @@ class Outcome:
         train_s: seconds of each fit [s], without validation.
         train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
         figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
-        score_s: seconds that scoring took [s].
         notes: what the first fold's fit said.
         limited_by: the clock whose seconds decided something: on another machine the result may be another.
         cost: of all fits together.
@@ -77,16 +82,13 @@ class Outcome:
     train_s: tuple[float, ...]
     train_cpu_s: tuple[float, ...]
     figures: dict[str, float | None]
-    score_s: float
     notes: tuple[str, ...]
     limited_by: Clock | None = None
     cost: Cost = NO_COST
 
-    def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
+    def scored_on(self, data: Measurements, split: Split) -> Outcome:
         """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
-        started = time.perf_counter()
-        figures = pooled(score(self.methods, data, split, eval_on), data, split)
-        return replace(self, figures=figures, score_s=time.perf_counter() - started)
+        return replace(self, figures=pooled(score(self.methods, data, split), data, split))
 
 
 def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
@@ -138,6 +140,6 @@ def fit_folds(
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return Outcome(
         # Notes of the first fold stand for all: the others differ in numbers.
-        methods, tuple(one.seconds for one in reports), processor, {}, 0.0, reports[0].notes,
+        methods, tuple(one.seconds for one in reports), processor, {}, reports[0].notes,
         less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

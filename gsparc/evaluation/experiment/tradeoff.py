@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,9 +21,8 @@ from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
-from gsparc.evaluation.open_runs import Opened, trained_on
+from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import Scores, rows_of, score
-from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Point, Settings, cost_of_halving, worded
 from gsparc.models.per_station import PerStation
@@ -185,24 +183,11 @@ def draw_front(
     return figure
 
 
-def others_of(
-    run: Opened, baselines: Sequence[str], peers: Sequence[str], ckpt: str, eval_on: str
-) -> dict[str, tuple[Method, float | None]]:
-    """Baselines and the methods in other checkpoints, with the deciding figure of each."""
-    figure, data = DECIDING[run.data.site.scored], run.data
-    whole = Split("tradeoff", (run.split.folds[0],), "")
-    methods: dict[str, tuple[Method, float | None]] = {}
-    for name in baselines:
-        fitted = baseline(name, data, run.split, eval_on)
-        methods[name] = (fitted.methods[0], fitted.scores.figures()[figure])
-    for path in peers:
-        method, other = loading.load(path)
-        if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
-            raise ValueError(f"peers: {path} was trained on another split than {ckpt}")
-        names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
-        name = next(name for name in names if name not in methods)
-        methods[name] = (method, score([method], data, whole, eval_on).figures()[figure])
-    return methods
+def others_of(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, tuple[Method, float | None]]:
+    """Baselines with the deciding figure of each."""
+    fitted = {name: baseline(name, run.data, run.split, eval_on) for name in baselines}
+    figure = DECIDING[run.data.site.scored]
+    return {name: (one.methods[0], one.scores.figures()[figure]) for name, one in fitted.items()}
 
 
 def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float) -> pd.DataFrame:

@@ -134,4 +134,4 @@ def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
     assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
     found = fits.scored_on(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3
-    assert found.figures["samples"] == 48 and found.score_s > 0
+    assert found.figures["samples"] == 48
