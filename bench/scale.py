@@ -43,10 +43,6 @@ CHANNELS = ("mean", "nearest", "complex_gp")
 SPECTRA = ("mean", "idw", "gp", "gsparc")
 # Single queries have no batch to share their overhead: 40 are enough for a mean.
 SINGLE = 40  # queries asked one by one, for the time of one
-HEAD = (
-    "source", "method", "label", "rows", "fit_cpu_s", "fit_wall_s", "query_cpu_ms", "rmse", "rmse_error",
-    "data_gb", "peak_gb", "private_gb", "load",
-)  # fmt: skip
 
 
 def make(name: str) -> MethodFactory:
@@ -79,7 +75,7 @@ def peak_gb() -> float:
 
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
-    """Write a line of one method."""
+    """Write a line of one method, in the columns of docs/results/scale/powers.csv."""
     before, private, factory = peak_gb(), Private(), for_stations(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
@@ -203,8 +199,6 @@ def main(kind: str, *rest: str) -> None:
         channels(Path(rest[0]), counts, methods or CHANNELS)
     elif kind == "spectra":
         spectra(Path(rest[0]), counts, methods or SPECTRA)
-    elif kind == "head":
-        csv.writer(sys.stdout).writerow(HEAD)
     else:
         from scale_pictures import draw
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
-from gsparc.evaluation.summary import provenance, shown, table, write_summary
+from gsparc.evaluation.summary import markdown_table, provenance, shown, table, write_summary
 from gsparc.ops.native import instruction_set
 from gsparc.prediction.bench.claims import Claim, cases, claims
 from gsparc.prediction.bench.measure import Machine, Row, facts, measure
@@ -95,7 +95,6 @@ def page(facts: Mapping[str, object], tables: Sequence[Table]) -> str:
     lines = [f"# {head}, {load}, commit {facts['git']}"]
     lines += ["", "Ratios of interleaved rounds (fastest fifth), times in ms (median)."]
     for columns in (each.columns for each in tables):
-        rule = ["---:" if column.justify == "right" else "---" for column in columns]
-        cells = zip(*(column.cells for column in columns), strict=True)
-        lines += ["", *(f"| {' | '.join(row)} |" for row in ([str(c.header) for c in columns], rule, *cells))]
+        cells = zip(*(map(str, column.cells) for column in columns), strict=True)
+        lines += ["", *markdown_table([str(column.header) for column in columns], cells, numbers=True)]
     return "\n".join(lines) + "\n"

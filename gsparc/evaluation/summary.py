@@ -230,22 +230,24 @@ def _cell(value: Any) -> Any:
     return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
 
 
+def git(folder: Path, *arguments: str) -> str | None:
+    """Return what git says in a folder, None where it fails."""
+    command = ["git", "-C", str(folder), *arguments]
+    try:
+        process = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return process.stdout.strip() if process.returncode == 0 else None
+
+
 def _git() -> str | None:
     here = Path(__file__).resolve()
-
-    def ask(*arguments: str) -> str | None:
-        command = ["git", "-C", str(here.parent), *arguments]
-        try:
-            process = subprocess.run(command, capture_output=True, text=True, timeout=10)
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return process.stdout.strip() if process.returncode == 0 else None
-
-    if ask("ls-files", "--error-unmatch", here.name) is None:  # an installed copy inside someone else's tree
+    # None in an installed copy inside someone else's tree.
+    if git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
         return None
-    commit = ask("rev-parse", "HEAD")
+    commit = git(here.parent, "rev-parse", "HEAD")
     # Untracked files are mostly results of runs: with them every tree would count as edited.
-    edited = commit and ask("status", "--porcelain", "--untracked-files=no")
+    edited = commit and git(here.parent, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}-dirty" if edited else commit
 
 

@@ -136,12 +136,12 @@ def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray
         for low, high in room.occluders:
             corner, other = signs * low + offsets, signs * high + offsets
             for box_low, box_high in zip(np.minimum(corner, other), np.maximum(corner, other), strict=True):
-                seen[:, i] &= ~_meets(observer, places[:, i], box_low, box_high)
+                seen[:, i] &= ~meets(observer, places[:, i], box_low, box_high)
     return seen
 
 
-def _meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Whether segments start -> end (S, 3) meet the box from low to high (3,): (S,) bool; slab test."""
+def meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Tell whether segments start -> end (S, D) meet the box from low to high (D,): (S,) bool; slab test."""
     along = end - start
     parallel = along == 0
     # Any divisor does: along a parallel axis `outside` decides alone.

@@ -15,6 +15,7 @@ from itertools import pairwise, permutations
 import numpy as np
 
 from gsparc.data.schema import LIGHT
+from gsparc.simulate.shoebox import meets
 
 SHRINK = 1e-6  # [m]; a reflection point on a wall does not lie inside the building
 STRONGEST = 64  # paths of a user
@@ -50,14 +51,10 @@ class Streets:
 
     def blocked(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Tell whether a building stands between points a and b (S, 2) [m]: (S,) bool."""
-        low, high = self.buildings[:, 0] + SHRINK, self.buildings[:, 1] - SHRINK
-        along = (b - a)[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = (low - a[:, None]) / along, (high - a[:, None]) / along
-        # A ray parallel to a side and outside it gives infinities of one sign, which never overlap.
-        enter = np.nanmax(np.minimum(first, second), axis=-1)
-        leave = np.nanmin(np.maximum(first, second), axis=-1)
-        return ((enter < leave) & (leave > 0) & (enter < 1)).any(axis=1)
+        hit = np.zeros(len(a), dtype=bool)
+        for low, high in self.buildings:
+            hit |= meets(a, b, low + SHRINK, high - SHRINK)
+        return hit
 
     def open(self, points: np.ndarray) -> np.ndarray:
         """Tell whether points (S, 2) [m] lie outside every building: (S,) bool."""

@@ -111,30 +111,28 @@ def plan(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-
     able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
-    chosen: list[tuple[Problem, Contender, float | None, int | None]] = []
     # Methods without a budget first: they stand in the tables of all budgets.
-    chosen += [(problem, m, None, None) for problem, those in able for m in those if not m.budget]
-    longest = max((b.seconds for b in budgets), default=0.0)
-    turns = max((len(b.seeds) for b in budgets), default=0)
-    for turn in range(turns):  # first seeds of all budgets before second ones
-        for budget in (b for b in budgets if turn < len(b.seeds)):
-            for problem, those in able:
-                if budget.splits and problem.split not in budget.splits:
-                    continue
-                # A drawn split has its draws for seeds: further seeds would repeat the first draw.
-                if turn and problem.draw is not None:
-                    continue
-                chosen += [
-                    (problem, m, budget.seconds, budget.seeds[turn])
-                    for m in those
-                    if m.budget and not (m.only_longest and (turn > 0 or budget.seconds < longest))
-                ]
     cells = [
-        (p, Cell(p.dataset, p.split, m.name, budget_s, seed if p.draw is None else p.draw))
-        for p, m, budget_s, seed in chosen
+        (p, Cell(p.dataset, p.split, m.name, None, p.draw))
+        for p, those in able
+        for m in those
+        if not m.budget
     ]
+    longest = max((b.seconds for b in budgets), default=0.0)
+    # First seeds of all budgets before second ones.
+    turns = ((n, b) for n in range(max((len(b.seeds) for b in budgets), default=0)) for b in budgets)
+    for turn, budget in ((n, b) for n, b in turns if n < len(b.seeds)):
+        for problem, those in able:
+            # A drawn split has its draws for seeds: further seeds would repeat the first draw.
+            if (budget.splits and problem.split not in budget.splits) or (turn and problem.draw is not None):
+                continue
+            seed = budget.seeds[turn] if problem.draw is None else problem.draw
+            cells += [
+                (problem, Cell(problem.dataset, problem.split, m.name, budget.seconds, seed))
+                for m in those
+                if m.budget and not (m.only_longest and (turn > 0 or budget.seconds < longest))
+            ]
     names = [str(cell) for _, cell in cells]
     for pattern in only:
         if not any(fnmatchcase(name, pattern) for name in names):

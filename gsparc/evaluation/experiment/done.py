@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import re
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -25,7 +24,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import targets
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.summary import read_summary
+from gsparc.evaluation.summary import git, read_summary
 from gsparc.models.fitting import LAST, leaves
 
 log = logging.getLogger(__name__)
@@ -207,19 +206,11 @@ def code_of(text: str) -> str:
 
 def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
     """The root of the working tree that a package is tracked in, and its program's files; None: in none."""
-
-    def ask(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
-        try:
-            return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout
-        except (OSError, subprocess.SubprocessError):
-            return ""
-
-    root = ask("rev-parse", "--show-toplevel").strip()
-    if not root or not ask("ls-files"):
+    root = git(folder, "rev-parse", "--show-toplevel")
+    if not root or not git(folder, "ls-files"):
         return None
-    files = ask("-C", root, "ls-files", "-z", "--cached", "--others", "--exclude-standard").split("\0")
-    texts = [one for one in files if one.endswith(PROGRAM)]
+    files = git(Path(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard") or ""
+    texts = [one for one in files.split("\0") if one.endswith(PROGRAM)]
     own = str(folder.relative_to(root))  # of a plugin among the examples, too
     return Path(root), [one for one in texts if not one.startswith(NO_PROGRAM) or one.startswith(own)]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -32,6 +32,7 @@ ENDLESS_MS = 10_000.0  # from here on it is timed once
 # 60 rounds give a 95th percentile from three samples beyond it.
 FAST = ClockSettings(rounds=60, budget_s=30.0)
 SLOW = ClockSettings(rounds=5, least=1, warmup=0, budget_s=20.0)
+ONCE = replace(SLOW, rounds=1)
 
 
 @dataclass(frozen=True)
@@ -59,27 +60,21 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
             # The first of a method's cells stands for all of its budgets and seeds.
             methods[one.cell.method] = loading.load(one.checkpoint)[0]
     calls = cycling(methods, queries(data, split.folds[0].test))
-    # One call of each, to sort them by speed before any takes a share of the rounds.
-    once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
-    endless = {name for name in calls if once[name][0] > ENDLESS_MS}
-    cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
-    warm = interleaved(cold, replace(SLOW, rounds=1))  # a first call may make what later ones keep
-    slow = {name for name in cold if warm[name][0] > SLOW_MS}
-    summaries = {name: latency for name, latency in _summaries(once).items() if name in endless}
-    for group, clock in ((set(calls) - slow - endless, FAST), (slow, SLOW)):
-        if group:
-            timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
-            summaries |= _summaries(timed)
-    return {name: summaries[name] for name in methods}
+    found: dict[str, Latency] = {}
 
+    def timed(names: Iterable[str], clock: ClockSettings) -> None:
+        times = interleaved({COPY: reference_copy(), **{name: calls[name] for name in names}}, clock)
+        copy = float(np.median(times.pop(COPY)))
+        for name, values in times.items():
+            found[name] = Latency(*percentiles(values), float(np.median(values)) / copy, len(values))
 
-def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
-    copy = float(np.median(times[COPY]))
-    return {
-        name: Latency(*percentiles(values), float(np.median(values)) / copy, len(values))
-        for name, values in times.items()
-        if name != COPY
-    }
+    # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
+    timed(calls, ONCE)
+    timed([name for name, one in found.items() if SLOW_MS < one.p50_ms <= ENDLESS_MS], ONCE)
+    speeds = {name: one.p50_ms for name, one in found.items()}
+    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], FAST)
+    timed([name for name, ms in speeds.items() if SLOW_MS < ms <= ENDLESS_MS], SLOW)
+    return {name: found[name] for name in methods}
 
 
 def timed_here(

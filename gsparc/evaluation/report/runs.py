@@ -178,8 +178,8 @@ def read_run(folder: Path) -> Run:
         facts,
         samples,
         {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
-        _overrides(folder / ".hydra" / "overrides.yaml"),
-        _config(folder / ".hydra" / "config.yaml"),
+        tuple(map(str, _written(folder / ".hydra" / "overrides.yaml"))),
+        dict(leaves(_written(folder / ".hydra" / "config.yaml") or {})),
         np.zeros(0) if render is None else render,
     )
 
@@ -195,16 +195,9 @@ def columns(path: Path) -> dict[str, np.ndarray]:
     return {} if frame.empty else {name: frame[name].to_numpy() for name in frame}
 
 
-def _overrides(path: Path) -> tuple[str, ...]:
-    if not path.is_file():
-        return ()
-    return tuple(str(line) for line in load_yaml(path.read_text(encoding="utf-8"), path) or ())
-
-
-def _config(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    return dict(leaves(load_yaml(path.read_text(encoding="utf-8"), path) or {}))
+def _written(path: Path) -> Any:
+    """What Hydra wrote there, if anything."""
+    return (load_yaml(path.read_text(encoding="utf-8"), path) if path.is_file() else None) or ()
 
 
 def sizes(run: Run, name: str) -> np.ndarray:
