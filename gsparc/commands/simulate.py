@@ -20,7 +20,7 @@ from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import Sampling
-from gsparc.simulate.report import choice_table, closing, figures, reasons
+from gsparc.simulate.report import choice_table, closing, figures
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.scenes.solid import write_mesh
 from gsparc.simulate.settings import Campaign
@@ -80,8 +80,6 @@ def task(config: DictConfig) -> Outcome | None:
     if outcome.choice is not None:
         simulated.effect_shares(outcome.choice, run_dir / "effects.png")
         console.print(choice_table(outcome.choice))
-        for line in reasons(outcome.choice):
-            console.print(line, highlight=False, soft_wrap=True, markup=False)
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
         **figures(outcome),

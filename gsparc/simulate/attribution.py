@@ -7,7 +7,6 @@ the solver's noise.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -208,50 +207,3 @@ def _without(effects: PropagationEffects, name: str) -> PropagationEffects | Non
         return effects.without(name)
     except ValueError:
         return None
-
-
-def reasons(
-    probe: Probe, distances: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
-) -> dict[str, str]:
-    """Return why an effect should or should not matter, by its name; absent where there is no short one.
-
-    Distances (R,) [m] are between the ends; of materials `permittivity`, `thickness_m` and `scattering` are
-    read where given.
-    """
-    wavelength, paths = probe.wavelength, probe.paths
-    distance = float(np.median(distances))
-    sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
-    zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
-    # A coefficient S scatters the share S^2 of what is reflected (V. Degli-Esposti et al. 2007).
-    rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
-    reasons = {
-        "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",
-        "diffraction": f"{zone}; {1 - sight.mean():.0%} shadowed",
-        "diffuse": f"smooth below {wavelength / 8 * 1e3:.2g} mm of relief (Rayleigh)"
-        + (f"; S^2 is {min(rough):.1%} to {max(rough):.1%} of a reflection" if rough else ""),
-    }
-    # A conductor's permittivity is 1: its loss is not in this number.
-    slabs = {name: m for name, m in materials.items() if float(m.get("permittivity", 0.0)) > 1.01}
-    losses = {
-        name: _normal_incidence(m, wavelength)
-        for name, m in slabs.items()
-        if float(m.get("thickness_m", 0.0)) > 0
-    }
-    if losses:
-        through = {f"{loss:.1f} dB ({name})": loss for name, (_, loss) in losses.items()}
-        clearest, densest = min(through, key=through.__getitem__), max(through, key=through.__getitem__)
-        reasons["refraction"] = f"a sheet costs {clearest} to {densest}"
-        mirror = -10 * np.log10(np.median([10 ** (-loss / 10) for loss, _ in losses.values()]))
-        reasons["depth"] = f"a reflection costs about {mirror:.0f} dB"
-    return reasons
-
-
-def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[float, float]:
-    """Loss [dB] of a reflection off, and of a passage through, a lossless slab at normal incidence."""
-    index = np.sqrt(float(material["permittivity"]))
-    fresnel = (1 - index) / (1 + index)
-    # Airy's sum over all passes through the slab; what does not pass a lossless one comes back.
-    turn = np.exp(-4j * np.pi * index * float(material["thickness_m"]) / wavelength)
-    through = (1 - fresnel**2) * np.sqrt(turn) / (1 - fresnel**2 * turn)
-    back = 1 - abs(through) ** 2
-    return -10 * np.log10(max(back, 1e-9)), -20 * np.log10(max(abs(through), 1e-9))

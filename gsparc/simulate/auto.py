@@ -81,7 +81,6 @@ class EffectRow:
         nmse, nmse_p95: of the channel, median and 95th percentile.
         error, error_p95: of the deliverable, likewise.
         failures: probes beyond the tolerance.
-        reason: expectation from physics; empty where there is none.
         kept: whether the requirement needs it.
     """
 
@@ -93,7 +92,6 @@ class EffectRow:
     error: float
     error_p95: float
     failures: int
-    reason: str
     kept: bool
 
 
@@ -211,12 +209,6 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
     return Choice(chosen, str(required), tuple(table), len(probe.reached))
 
 
-def explained(choice: Choice, reasons: Mapping[str, str]) -> Choice:
-    """Return the choice with expectations from physics, by effect."""
-    table = (replace(row, reason=reasons.get(row.effect.split(" > ")[0], "")) for row in choice.table)
-    return replace(choice, table=tuple(table))
-
-
 def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
     """Return the choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
     if not len(errors):
@@ -325,7 +317,7 @@ def _row(name: str, probe: Probe, less: PropagationEffects | Paths, required: De
     share, nmse, error = (part[probe.reached] for part in parts)
     return EffectRow(
         name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-        float(np.median(error)), _p95(error), int((error > required.tolerance).sum()), "", True,
+        float(np.median(error)), _p95(error), int((error > required.tolerance).sum()), True,
     )  # fmt: skip
 
 

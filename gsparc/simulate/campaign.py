@@ -26,7 +26,7 @@ from gsparc.simulate.survey import Survey
 log = logging.getLogger(__name__)
 
 STAGES = ("build", "decide", "trace", "converge", "write")
-PARTS = 3  # version of what a shard holds: those of another are refused
+PARTS = 4  # version of what a shard holds: those of another are refused
 
 
 @dataclass(frozen=True)

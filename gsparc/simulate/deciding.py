@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsparc.simulate import auto
-from gsparc.simulate.attribution import Probe, reasons
+from gsparc.simulate.attribution import Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths, join
@@ -193,13 +193,10 @@ class Decider:
 
     def _choose(self, traced: Traced) -> Choice:
         """By the first look and, where it leaves something open, the last."""
-        materials, distances = self.survey.engine.materials(), self.survey.distances()
 
         def judge(rows: np.ndarray, last: bool) -> Choice | None:
             log.info("auto: %d probes with %s", len(rows), traced.effects)
-            probe = self._probe(traced, rows)
-            choice = auto.decide(probe, self.settings, last)
-            return choice and auto.explained(choice, reasons(probe, distances[rows], materials))
+            return auto.decide(self._probe(traced, rows), self.settings, last)
 
         return _until_clear(self.probes, judge)
 

@@ -30,13 +30,6 @@ def choice_table(choice: Choice) -> Table:
     return table
 
 
-def reasons(choice: Choice) -> list[str]:
-    """Return expectations from physics, one line per effect."""
-    # All depths share one reason.
-    by_effect = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
-    return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in by_effect.items()]
-
-
 def verdict(choice: Choice) -> str:
     """Return what was chosen, what it saves, and whether the requirement is met on held-back receivers."""
     chosen = f"needed: {choice.effects}"
