@@ -95,14 +95,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     kinds = "npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release"
     add("path", nargs="+", help=kinds)
-    column = "of a table: which column is what"
-    add("--column", action="append", default=[], metavar="NAME=HEAD", help=column)
     add("--stations-file", help="of a table: a second one that lists the stations")
     add("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
     add("--no-draw", action="store_true", help="no map of places, levels and what looks wrong")
     args = parser.parse_intermixed_args(arguments)
-    columns = dict(text.partition("=")[::2] for text in args.column)
-    settings: dict[str, Any] = {}
+    columns, settings = dict[str, str](), dict[str, Any]()
     for said in filter(None, map(SETTING.fullmatch, args.path[:])):  # as refusals and notes say them
         args.path.remove(said[0])
         if said[1] == "stations_file":

@@ -1,7 +1,7 @@
 """`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
 
 Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
-accuracy under its own name, seconds of training, milliseconds of a query and their ratios to `base`.
+accuracy under its own name, seconds of training and milliseconds of a query.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ def study_of(config: DictConfig) -> Study:
     return Study(
         variants_of(config),
         instantiate(config.kind).conditions(),
-        config.base,
         int(config.rounds),
         int(config.seed),
         ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s)),
@@ -69,24 +68,21 @@ def task(config: DictConfig) -> pd.DataFrame:
         raise KeyboardInterrupt(message) from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base, **facts_of(rows),
+        "seed": settings.seed, "study/rounds": study.rounds, **facts_of(rows),
     }  # fmt: skip
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")
-    ratios = "" if study.base is None else f"ratios to {study.base!r}; "
-    finish(
-        run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()), before=ratios
-    )
+    finish(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))
     return rows
 
 
 def table_of(rows: pd.DataFrame, title: str) -> Table:
-    """Return a table with a line per row; conditions and ratios where the study has any."""
-    changed, compared = (rows.what != "none").any(), rows.train_ratio.notna().any()
-    heads = {"train_s": "train s", "train_ratio": "ratio", "train_cpu_s": "cpu s", "query_ms": "query ms",
-             "query_p95_ms": "p95", "query_ratio": "ratio"}  # fmt: skip
-    costs = [name for name in heads if compared or not name.endswith("_ratio")]
+    """Return a table with a line per row; conditions where the study has any."""
+    changed = (rows.what != "none").any()
+    costs = {
+        "train_s": "train s", "train_cpu_s": "cpu s", "query_ms": "query ms", "query_p95_ms": "p95"
+    }  # fmt: skip
     lines = []
     for row in rows.to_dict("records"):
         change = row["what"] if row["what"] == "none" else f"{row['what']} {row['amount']:g}"
@@ -94,5 +90,5 @@ def table_of(rows: pd.DataFrame, title: str) -> Table:
         words = [row["variant"], row["effects"], *([change] if changed else [])]
         lines.append([*words, f"{row['rows']:g}", value, *(shown(row[name], ".3g") for name in costs)])
     words = ["variant", "effects", *(["changed"] if changed else [])]
-    numbers = ["rows", rows.figure.iloc[0], *(heads[name] for name in costs)]
+    numbers = ["rows", rows.figure.iloc[0], *costs.values()]
     return table(title, words, numbers, lines)

@@ -34,9 +34,8 @@ class Assembled:
         data: as `load_own` reads the file.
         power: (S,) sum of path powers.
         delay_spread: (S,) [s].
-        facts: numbers that decide what the data can be used for: `below_horizon`, the share of power that
-            an upper hemisphere cannot show; `bandwidth_times_delay_spread`, far below 1 where a channel is
-            flat over the band; `share_in_near_field`, where waves over the spectrum's array are not plane.
+        facts: numbers that decide what the data can be used for, as `below_horizon`, the share of power that
+            an upper hemisphere cannot show.
     """
 
     data: Measurements
@@ -90,13 +89,9 @@ def assemble(
     if not reached.any():
         raise ValueError("nothing reaches any receiver; is the transmitter inside a building?")
     spread_s = float(np.median(whole["delay_spread"][reached]))
-    near = campaign.spectrum.near_field(engine.wavelength)
     facts = {
         "below_horizon": float((whole["power_below"][reached] / power[reached]).mean()),
         "delay_spread_ns": spread_s * 1e9,
-        "bandwidth_times_delay_spread": spread_s * campaign.scene.bandwidth_hz,
-        "near_field_m": near,
-        "share_in_near_field": float((survey.distances() < near).mean()),
         "silent_receivers": float((~reached).sum()),
         "paths_per_receiver": len(paths.order) / len(survey),
     }

@@ -73,15 +73,6 @@ class SpectrumSettings(ArraySettings):
         """Directions of the pixels: the upper hemisphere."""
         return SphereGrid.hemisphere(self.height, self.width)
 
-    def near_field(self, wavelength: float) -> float:
-        """Return the array's Fraunhofer distance, 2 D^2 / wavelength [m]; nearer, waves on it are not plane.
-
-        >>> round(SpectrumSettings(rows=8, columns=8).near_field(wavelength=0.1), 3)
-        4.9
-        """
-        size = float(np.linalg.norm(np.ptp(self.elements(wavelength), axis=0)))
-        return 2 * size**2 / wavelength
-
     def attributes(self) -> dict[str, str | float | int]:
         """Return the definition as attributes of a file."""
         drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")

@@ -59,10 +59,6 @@ class Survey:
         """Return the same with so many rays of a call."""
         return replace(self, engines=[engine.thinned(samples) for engine in self.engines])
 
-    def distances(self) -> np.ndarray:
-        """Return distances (S,) [m] between the ends of each row."""
-        return np.linalg.norm(self.receivers - self.transmitters[self.station], axis=1)
-
     def spread(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
         order, turns = spread(self.places, min(count, len(self.places)), seed), len(self.engines)

@@ -11,7 +11,7 @@ from gsparc.models.terms import EffectSettings
 
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
-    "effects": (["base=plain"], ["none"], "study/plain/psnr_db"),
+    "effects": ([], ["none"], "study/plain/psnr_db"),
     "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train", "train_known"],
         "study/mean/query/0.1/psnr_db"),
     "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"], "study/mean/keep/0.5/train_s"),
@@ -41,7 +41,7 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
 def test_each_kind_has_its_variants_and_baselines():
     effects, positions, measured = (study_of(compose(f"kind={kind}", config="study")) for kind in LINES)
     names = [*effects.variants]
-    assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
+    assert names[0] == "plain" and {"array", "phase", "power", "gp"} <= set(names)
     assert [*positions.variants] == [*measured.variants]
     assert len(positions.conditions) == 19 and len(measured.conditions) == 4 and measured.rounds == 3
 

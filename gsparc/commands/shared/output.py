@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +47,6 @@ def finish(run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **h
     write_summary(run_dir / "summary.json", whole)
     show(run_dir, *tables, **how)
     return whole
-
-
-def columns(rows: Sequence[Any], of: type) -> dict[str, list[Any]]:
-    """Return columns of a CSV file from instances of the dataclass `of`; None becomes an empty cell."""
-    values = {field.name: [getattr(row, field.name) for row in rows] for field in fields(of)}
-    return {name: ["" if value is None else value for value in column] for name, column in values.items()}
 
 
 def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:

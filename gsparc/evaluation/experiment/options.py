@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -17,7 +15,6 @@ from gsparc.data.heeded import Option, Reads
 from gsparc.data.instantiate import find
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
-from gsparc.evaluation.console import config_folder
 from gsparc.models.fitting import leaves
 from gsparc.models.method import Method, MethodFactory
 
@@ -37,12 +34,11 @@ NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is 
 
 
 def given() -> dict[str, str]:
-    """Return what the command line and its experiment file say: words by dotted names of settings."""
+    """Return what the command line says: words by dotted names of settings."""
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
-    experiment = _of_experiment(hydra.runtime, hydra.runtime.choices.get("experiment"))
-    said = {path: f"{path}={value}" for path, value in experiment}
+    said: dict[str, str] = {}
     # Hydra's own grammar: quotes, lists and + or ~ at the head are not to be split by hand.
     for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
         path, value = one.key_or_group, one.value()
@@ -50,22 +46,6 @@ def given() -> dict[str, str]:
         said |= {name: one.input_line or name for name, _ in inner}
     # A file of the group `init` is as good as its name.
     return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
-
-
-def _of_experiment(runtime: Any, choice: str | None) -> Iterator[tuple[str, Any]]:
-    """What an experiment file says itself, after those of its folder that it builds on."""
-    for source in runtime.config_sources if choice else ():
-        folder = Path(source.path) if source.schema == "file" else config_folder()
-        file = folder / "experiment" / f"{choice}.yaml"
-        if file.exists():
-            text = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-            for one in text.get("defaults", ()):
-                # The defaults of a file come before its own words, which may replace them.
-                if isinstance(one, str) and one != "_self_":
-                    yield from _of_experiment(runtime, one)
-            yield from leaves({key: value for key, value in text.items() if key not in ("defaults", "hydra")})
-            # The first source that has the file is the one that Hydra took.
-            return
 
 
 def noting(config: DictConfig, method: MethodFactory) -> Reads:

@@ -89,7 +89,7 @@ class Condition:
 
 ROW = (
     "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
-    "train_ratio", "query_ms", "query_p95_ms", "query_ratio",
+    "query_ms", "query_p95_ms",
 )  # fmt: skip
 NAMES = ("variant", "what", "amount", "figure", "value", "spread")
 
@@ -114,7 +114,6 @@ class Study:
     Attributes:
         variants: what makes a method, or what chooses it, by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
-        base: name of the variant that times are compared with; None: no ratios.
         rounds: trainings of each, in turns; round r uses seed + r.
         seed: of the first round.
         clock: of the queries.
@@ -122,14 +121,9 @@ class Study:
 
     variants: Mapping[str, Callable[[], MethodFactory]]
     conditions: Sequence[Condition] = (Condition(),)
-    base: str | None = None
     rounds: int = 1
     seed: int = 0
     clock: ClockSettings = field(default_factory=ClockSettings)
-
-    def __post_init__(self) -> None:
-        if self.base is not None and self.base not in self.variants:
-            raise ValueError(f"base={self.base}: no such variant; there are {', '.join(self.variants)}")
 
     def run(self, data: Measurements, split: Split, context: FitContext, state: State) -> pd.DataFrame:
         """Fit, score and time everything; a variant that the data do not allow is left out.
@@ -146,12 +140,12 @@ class Study:
             `effects` that the variant computes; measurements (`rows`) that it learned from, mean over folds.
             `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard deviation.
             `train_s`, `train_cpu_s`: training of one model by the clock and of the processor, median over
-            rounds [s]; `train_ratio`: median of `train_s` to the base variant's of the same round.
-            `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms];
-            `query_ratio`: to the base variant's. NaN where there is no spread or ratio.
+            rounds [s].
+            `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
+            NaN where there is no spread.
 
         Raises:
-            ValueError: the base variant, or every variant, cannot be trained here.
+            ValueError: no variant can be trained here.
         """
         cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
         work = partial(self._tried, data=data, split=split, context=context, state=state)
@@ -163,8 +157,7 @@ class Study:
                 rows += [
                     {"variant": variant, "turn": turn, **one.row(facts, folder)} for one in self.conditions
                 ]
-            # Without the base there are no ratios, and without any variant no table: both end the study.
-            elif variant == self.base or not any(isinstance(one, dict) for one in found.values()):
+            elif not any(isinstance(one, dict) for one in found.values()):
                 raise ValueError(facts)
             elif turn == 0:
                 log.info("%s is left out: %s", variant, facts)
@@ -221,10 +214,9 @@ class Study:
 
     def _table(self, cells: pd.DataFrame, data: Measurements, split: Split) -> pd.DataFrame:
         """Rounds put together, and the models of the last one timed."""
-        cells["train_ratio"] = self._ratio(cells, "train_s", ["turn", "what", "amount"])
         # The model of the last round is timed: rounds differ in weights, not in size.
         last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
-        median = {name: (name, "median") for name in ("train_s", "train_cpu_s", "train_ratio")}
+        median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
         groups = cells.groupby(["variant", "what", "amount"], sort=False)
         rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
@@ -235,15 +227,7 @@ class Study:
         }
         times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [percentiles(times[file]) for file in rows.model]
-        rows["query_ratio"] = self._ratio(rows, "query_ms", ["what", "amount"])
         return rows[list(ROW)]
-
-    def _ratio(self, rows: pd.DataFrame, column: str, same: list[str]) -> Any:
-        """Of each row (n,) to the base variant's where these columns are the same; NaN without."""
-        base = rows[rows.variant == self.base].set_index(same)[column].to_dict()
-        own = rows[same].itertuples(index=False, name=None)
-        # NaN where the base has no row under the same condition.
-        return rows[column].to_numpy() / [base.get(key, np.nan) for key in own]
 
 
 def _value(outcome: Outcome, figure: str) -> float:

@@ -101,13 +101,12 @@ class Run:
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
-    """Training runs in and below directories, in the order given; simulations there give the cost of data.
+    """Training runs in and below directories, in the order given.
 
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
     """
     runs: dict[Path, Run] = {}
-    simulated: dict[str, float] = {}  # seconds by the content hash of what was made
     for path in map(Path, paths):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
@@ -116,18 +115,12 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
         files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
         every = {file.parent.resolve(): _facts(file) for file in files}
         here = [folder for folder, facts in every.items() if _is_run(facts)]
-        made = [facts for facts in every.values() if "time/total_s" in facts and "dataset/receivers" in facts]
-        if not here and not made and not any(path.rglob("tradeoff.csv")):
+        if not here and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
-        simulated |= {str(facts["dataset/sha256"]): float(facts["time/total_s"]) for facts in made}
         # A folder may be given twice, also by one above it.
         runs |= {folder: read_run(folder) for folder in here if folder not in runs}
     if not runs:
-        raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
-    for run in runs.values():
-        if run.facts.get("dataset/simulate_s") is None:
-            # By content: the same data may lie in another file; None stays where they were measured.
-            run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
+        raise ValueError("a swept front is no report: give the directory of a run too")
     return list(runs.values())
 
 

@@ -276,12 +276,3 @@ def test_what_other_processes_read_counts():
         assert fitted("stations", *given)[0] == {"trainer.max_steps"}
     finally:
         executor.use(Engine())
-
-
-def test_what_an_experiment_file_says_is_given_too(monkeypatch):
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        whole = hydra.compose("train", overrides=["experiment=ablation_field"], return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", whole)
-    own = options.given()
-    assert own["trainer.max_steps"] == "trainer.max_steps=400"
-    assert {"threads", "baselines"} < own.keys()  # of the file that it builds on

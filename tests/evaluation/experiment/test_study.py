@@ -1,4 +1,4 @@
-"""Each variant's accuracy, seconds and milliseconds beside the base's, under every condition of the data."""
+"""Each variant's accuracy, seconds and milliseconds, under every condition of the data."""
 
 from typing import ClassVar
 
@@ -70,27 +70,23 @@ class NeedsUplink(Quick):
         return super().predict(query)
 
 
-def test_times_are_ratios_to_the_base(monkeypatch, run):
+def test_variants_are_timed_in_turns_and_what_cannot_be_is_left_out(monkeypatch, run):
     monkeypatch.setattr(timing.time, "perf_counter", WATCH)
     made = dict(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
-    rows = run(Study(made, base="plain", rounds=2, clock=CLOCK), invent("csi"), divide(48))
+    rows = run(Study(made, rounds=2, clock=CLOCK), invent("csi"), divide(48))
     found = {row.variant: row for row in rows.itertuples()}
     assert list(found) == ["plain", "slow", "needs"]
-    assert found["plain"].query_ratio == found["plain"].train_ratio == 1
-    assert found["slow"].train_ratio == pytest.approx(3) and found["slow"].query_ms >= 4
-    assert 3 < found["slow"].query_ratio < 4 and found["slow"].effects == "sleep"  # 4.1 ms to 1.1
+    assert found["slow"].train_s == 3 * found["plain"].train_s and found["slow"].effects == "sleep"
+    assert 3 < found["slow"].query_ms / found["plain"].query_ms < 4  # 4.1 ms to 1.1
     assert found["slow"].value == found["needs"].value == pytest.approx(found["plain"].value)
     assert found["plain"].spread == 0 and found["plain"].rows == 36
     facts = facts_of(rows)
     assert facts["study/slow/train_s"] == 3 and {"study/slow/nmse", "study/slow/query_ms"} <= set(facts)
 
 
-def test_the_base_must_be_there(run):
-    with pytest.raises(ValueError, match="no such variant; there are mean"):
-        Study(dict(mean=Mean), base="plain")
-    for base in ("plain", None):
-        with pytest.raises(ValueError, match="not possible"):
-            run(Study(dict(plain=Impossible), base=base), invent("csi"), divide(48))
+def test_a_study_without_a_variant_that_can_be_is_refused(run):
+    with pytest.raises(ValueError, match="not possible"):
+        run(Study(dict(plain=Impossible)), invent("csi"), divide(48))
 
 
 def test_every_fit_gets_the_context_and_every_round_another_seed_once(run):

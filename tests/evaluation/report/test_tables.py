@@ -136,17 +136,6 @@ def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
 
 
-def test_a_simulation_among_the_directories_is_a_cost_of_its_data(three):
-    folder = three[0].parent / "simulated"
-    folder.mkdir()
-    made = {"dataset/sha256": "d" * 64, "time/total_s": 62.0, "dataset/receivers": 500}
-    (folder / "summary.json").write_text(json.dumps(made))
-    table = tables.results(find_runs([three[0], folder]))
-    assert cells(table, 0)["s simulated"] == 62.0 and [row[0] for row in table.rows[1:]] == ["mean", "gp"]
-    with pytest.raises(ValueError, match="give the directory of a run too"):
-        find_runs([folder])
-
-
 def test_labels_keep_the_value_that_tells_settings_apart():
     """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
     said = [short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
