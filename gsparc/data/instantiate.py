@@ -84,7 +84,7 @@ PLAIN = (bool, int, float, str, list, dict, type(None))
 
 
 def plugins(group: str) -> dict[str, str]:
-    """Return the import path `module.Class` of every plugin of a config group, `model`, `dataset` or `terms`."""
+    """Return the import path `module.Class` of every plugin: of `model`, `dataset` or `terms`."""
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])}
 
 

@@ -48,8 +48,8 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
 
     Args:
         config: `_target_` and its arguments.
-        trusted: False for text out of a file: then every `_target_` must be a class of gsparc, of an installed
-            plugin, or a term that was imported.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc or of an
+            installed plugin, or a term that was imported.
 
     Raises:
         ValueError: no or wrong `_target_`, or settings it does not take.

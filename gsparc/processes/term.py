@@ -16,7 +16,7 @@ Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powe
 
 
 def name_of(kind: type) -> str:
-    """Return the name that a class is stored by: of one that is not ours with its module, as it is imported."""
+    """Return the name that a class is stored by: with its module where that is not ours."""
     ours = kind.__module__.startswith("gsparc.")
     return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
 

@@ -47,7 +47,7 @@ class InWorld(Columns):
 
 
 def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:
-    """Return a sentence on each term: its weights [dB of a unit of a column], and what is not known of them."""
+    """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
     at = posterior.rows
     columns = posterior.prior.columns(at)
     weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude

@@ -61,13 +61,13 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
     assert errors[0] < 0.9 * errors[1], errors
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), own.rssi(rx=asked), atol=1e-5)
     term.KINDS.pop("trees.Trees")
-    with pytest.raises(CheckpointError, match="no term is called 'trees.Trees': import the file that defines it"):
+    with pytest.raises(CheckpointError, match=r"no term is called 'trees\.Trees': import the file"):
         gsparc.load(path)
 
 
 def test_what_is_no_term_is_refused():
     data = town()
-    with pytest.raises(ValueError, match="3 is not a gsparc.processes.term.Columns"):
+    with pytest.raises(ValueError, match="3 is not a gsparc"):
         gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings={"terms": [3]})
 
 
@@ -114,7 +114,7 @@ def test_opening_a_checkpoint_runs_nothing_that_its_terms_name(tmp_path):
     terms = [{"_target_": "subprocess.Popen", "args": ["touch", str(made)]}]
     model = {"_target_": "gsparc.models.mixture.methods.Powers", "terms": terms}
     checkpoint.save(path, fitted.method, OmegaConf.to_yaml({"model": model}))
-    with pytest.raises(CheckpointError, match="asks to run 'subprocess.Popen'"):
+    with pytest.raises(CheckpointError, match=r"asks to run 'subprocess\.Popen'"):
         gsparc.load(path)
     assert not made.exists()
 
