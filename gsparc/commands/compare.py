@@ -65,7 +65,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
-    timed = timed_here(filled, by_name, cells_dir, bool(settings["latency"]))
+    timed = timed_here(filled, by_name) if settings["latency"] else {}
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.files import whole_file
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models import loading
@@ -78,21 +75,15 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
 
 
 def timed_here(
-    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], cells_dir: Path, measure: bool
+    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem]
 ) -> dict[str, dict[str, Latency]]:
-    """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
-    by_dataset: dict[str, dict[str, Latency]] = {}
+    """Return latencies by dataset and method, of the first split that is there and keeps its models."""
+    found: dict[str, dict[str, Latency]] = {}
     for dataset in dict.fromkeys(one.cell.dataset for one in filled):
         here = [one for one in filled if one.cell.dataset == dataset]
-        split, file = here[0].cell.split, cells_dir / f"latency-{dataset}.json"
+        split = here[0].cell.split
         present = [one for one in here if one.cell.split == split and one.checkpoint.exists()]
-        stored = json.loads(file.read_text()) if file.exists() else {}
-        if measure and present:
+        if present:
             log.info("%s: timing single queries of every method in turns", dataset)
-            by_dataset[dataset] = latencies(present, problems[dataset, split])
-            rows = {name: asdict(one) for name, one in by_dataset[dataset].items()}
-            with whole_file(file) as partial:  # another comparison may read it
-                partial.write_text(json.dumps(rows, indent=2), encoding="utf-8")
-            continue
-        by_dataset[dataset] = {name: Latency(**values) for name, values in stored.items()}
-    return by_dataset
+            found[dataset] = latencies(present, problems[dataset, split])
+    return found
