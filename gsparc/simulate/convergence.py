@@ -22,14 +22,13 @@ class Convergence:
 
     Attributes:
         nmse: of the channels, sum |difference|^2 / sum |channel|^2.
-        spectrum_nmse, spectrum_mse, spectrum_psnr_db, spectrum_ssim: of the spectra.
+        spectrum_nmse, spectrum_psnr_db, spectrum_ssim: of the spectra.
         power_db: 95th percentile of |difference| of the received power, of receivers that both reach [dB].
         receivers: how many were traced twice.
     """
 
     nmse: float
     spectrum_nmse: float
-    spectrum_mse: float
     spectrum_psnr_db: float
     spectrum_ssim: float
     power_db: float
@@ -67,7 +66,6 @@ def convergence(
     return Convergence(
         nmse=float((np.abs(csi - other) ** 2).sum() / energy),
         spectrum_nmse=float(squared.sum() / (images[0] ** 2).mean((1, 2)).sum()),
-        spectrum_mse=float(squared.mean()),
         spectrum_psnr_db=float(np.mean(-10 * np.log10(np.maximum(squared, 1e-12)))),
         spectrum_ssim=float(np.mean(similar)),
         power_db=float(np.quantile(apart, 0.95)) if apart.size else 0.0,
