@@ -15,14 +15,15 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data import splits
+from gsparc.data import spacing
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, nearest
 from gsparc.data.instantiate import find, from_settings, refuse_foreign, suggest, targets
 from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
+from gsparc.data.split_files import read_split
+from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, without
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +99,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         absent = left_out(settings.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
     unit = data.run if settings.name == "runs" else data.station
-    place = splits.visits(data.moving, data.place)
+    place = spacing.visits(data.moving, data.place)
     if place is not None and place is not data.place:
         text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
         log.info(text, len(data), len(np.unique(place)))

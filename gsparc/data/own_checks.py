@@ -19,6 +19,13 @@ from gsparc.ops import SphereGrid
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
 
 
+Shape = tuple[int | str | None, ...]
+
+
+def _fits(sizes: tuple[int, ...], shape: Shape) -> bool:
+    return len(sizes) == len(shape) and all(want in (None, n) for want, n in zip(shape, sizes, strict=True))
+
+
 class Checker:
     """Takes arrays out of a `Raw`, noting what is wrong; a method returns None when its array is unusable."""
 
@@ -28,6 +35,7 @@ class Checker:
         self.notes: list[str] = []
         self.row_names: list[str] = []
         self.unknown: str | None = None  # a position that nobody gave
+        self.sizes: dict[str, int] = {}  # of axes by their letter
 
     def where(self, name: str) -> str:
         """Say how messages name an array of this file."""
@@ -84,9 +92,9 @@ class Checker:
             self.row_names = [str(name) for name in names]
         return self.row_names
 
-    def array(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+    def array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
         """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
-        array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
+        array, kinds = self.raw.arrays.get(name), kinds or KINDS.get(name, REAL)
         if array is None:
             return None
         # Images of uint16 hold no stated largest value; of uint8 it is 255.
@@ -95,25 +103,23 @@ class Checker:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
         return array if self.fits(name, array, *shapes) else None
 
-    def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+    def real(self, name: str, *shapes: Shape) -> np.ndarray | None:
         """Return the same as float64."""
         array = self.array(name, *shapes)
         return None if array is None else array.astype(np.float64)
 
-    def fits(self, name: str, array: np.ndarray, *shapes: tuple[int | None, ...]) -> bool:
-        """Tell whether `array` has one of `shapes`; note it when not."""
-        for shape in shapes:
-            if array.ndim == len(shape) and all(
-                want is None or want == size for want, size in zip(shape, array.shape, strict=True)
-            ):
-                return True
+    def fits(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
+        """Tell whether `array` has one of `shapes`, letters for sizes found before; note it when not."""
+        wanted = [tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes]
+        if any(_fits(array.shape, shape) for shape in wanted):
+            return True
         # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
-        turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
-        constrained = any(count is not None for shape in shapes for count in shape)
-        here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
-        actual = f"{array.shape}{'; transposed?' if turned else ''}"
-        known = f" {FIELDS[name].shape}" if name in FIELDS else ""
-        self.refuse(name, f"expected shape{known}{here}, found {actual}")
+        turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
+        here = " or ".join(str(shape).replace("None", "any") for shape in wanted)
+        here = f", here {here}" if any(size is not None for shape in wanted for size in shape) else ""
+        known = FIELDS[name].shape if name in FIELDS else str(shapes[0]).replace("'", "")
+        fault = f"found {array.shape}{'; transposed?' if turned else ''}"
+        self.refuse(name, f"expected shape {known}{here}, {fault}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
