@@ -76,14 +76,11 @@ def read_raw(path: str | Path) -> Raw:
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path)
-    if path.suffix.lower() in HDF5_SUFFIXES:
-        return _read_hdf5(path)
-    if path.suffix.lower() == ".mat":
-        return _read_mat(path)
-    suffix = path.suffix or "no ending"
-    raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
+    readers = {".npz": _read_npz, ".mat": _read_mat, **dict.fromkeys(HDF5_SUFFIXES, _read_hdf5)}
+    if path.suffix.lower() not in readers:
+        suffix = path.suffix or "no ending"
+        raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
+    return readers[path.suffix.lower()](path)
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
@@ -194,12 +191,10 @@ def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
     try:
-        archive = is_archive(path)
+        if not is_archive(path):  # numpy would take anything else for a pickle and speak of that
+            raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({reason(error)})") from None
-    if not archive:
-        # numpy would take anything else for a pickle and speak of that.
-        raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     refuse_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -218,11 +213,9 @@ def _read_npz(path: Path) -> Raw:
         return Raw(arrays)
     try:
         attributes = json.loads(str(text))
-        if not isinstance(attributes, dict):
-            raise TypeError(f"found a {type(attributes).__name__}")
-        units = attributes.pop("units", {})
+        units = attributes.pop("units", {}) if isinstance(attributes, dict) else None
         if not isinstance(units, dict):
-            raise TypeError("units is not a table")
+            raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is not a table")
     except (ValueError, TypeError, RecursionError) as error:
         raise DataError(f"{path}, attributes: expected a JSON table as text ({reason(error)})") from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})

@@ -28,7 +28,7 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample, station or path, and how many axes they then have.
 ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
-ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
+ALWAYS = ("mask", "place", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
 
@@ -148,9 +148,9 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     values, measured = raw.arrays[name], measured_links(raw, source)
     with np.errstate(divide="ignore", invalid="ignore"):
         # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
-        low = measured & ((10 * np.log10(values) if name == "rssi" else values) < min_rssi_db)
+        low = np.asarray(measured & ((10 * np.log10(values) if name == "rssi" else values) < min_rssi_db))
     if low.ndim == 1:
-        return _select(raw, ~low, option, source)
+        return _select(raw, np.asarray(~low), option, source)
     # A wide file cannot leave out single links: they are marked as not measured.
     measured &= ~low
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
