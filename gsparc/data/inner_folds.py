@@ -222,11 +222,8 @@ def _draws(
 def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds | None:
     """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
     number, name = int(station.max()) + 1, settings.name
-    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if name == "runs":
-        together = max(round(settings.test_fraction * number), 1)
-    together = min(together, number - 2)
-    settings = replace(settings, name="stations", leave_out=max(together, 0))
+    together = max(min(settings.together(number), number - 2), 0)
+    settings = replace(settings, name="stations", leave_out=together)
     where = np.zeros((len(station), 3))
     if number == 1:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -213,11 +214,16 @@ class Checker:
         if present == ["rx_rotation"]:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
+        return self.turned("rx_orientation", values, self.row_names)
+
+    def turned(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
+        """Return rotations (n, 3, 3) of quaternions (n, 4) of an array."""
         good = is_unit(values)
-        wrong = np.flatnonzero(~good)
-        bad = (f"{self.row_names[i]} = {np.array2string(values[i], separator=', ')}" for i in wrong)
-        where = self.where("rx_orientation")
-        self.problems.add_rows(where, bad, "expected a quaternion (w, x, y, z) of length 1")
+        bad = (
+            f"{rows[i]} = {np.array2string(values[i], separator=', ')}"
+            for i in np.flatnonzero(~good).tolist()
+        )
+        self.problems.add_rows(self.where(name), bad, "expected a quaternion (w, x, y, z) of length 1")
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
 
     def grid(self, height: int, width: int) -> SphereGrid | None:

@@ -215,7 +215,7 @@ def _read_npz(path: Path) -> Raw:
         attributes = json.loads(str(text))
         units = attributes.pop("units", {}) if isinstance(attributes, dict) else None
         if not isinstance(units, dict):
-            raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is not a table")
+            raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is no table")
     except (ValueError, TypeError, RecursionError) as error:
         raise DataError(f"{path}, attributes: expected a JSON table as text ({reason(error)})") from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})

@@ -150,12 +150,12 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
         # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
         low = np.asarray(measured & ((10 * np.log10(values) if name == "rssi" else values) < min_rssi_db))
     if low.ndim == 1:
-        return _select(raw, np.asarray(~low), option, source)
+        return _select(raw, np.logical_not(low), option, source)
     # A wide file cannot leave out single links: they are marked as not measured.
-    measured &= ~low
+    measured[low] = False
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _select(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
+    rest = _select(marked, np.asarray(measured.reshape(len(measured), -1).any(axis=1)), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 

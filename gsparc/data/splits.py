@@ -130,6 +130,12 @@ class SplitSettings(Checked):
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
             ROWS.check("leave_out", self.leave_out)
 
+    def together(self, count: int) -> int:
+        """Return how many of `count` stations, or runs, are held out together; 0: each in its turn."""
+        if self.name == "runs":
+            return max(round(self.test_fraction * count), 1)
+        return self.leave_out if isinstance(self.leave_out, int) else 0
+
 
 @dataclass(frozen=True)
 class FileSettings(Checked):
@@ -308,9 +314,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         raise DataError(f"split={name}: these measurements have one {name[:-1]}; take split=random or blocks")
     unit = np.unique(unit, return_inverse=True)[1].reshape(-1)
     count = int(unit.max()) + 1
-    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if name == "runs":
-        together = max(round(settings.test_fraction * count), 1)
+    together = settings.together(count)
     least = 2 if name == "stations" else 1
     if count - max(together, 1) < least:
         remain = "two at least must remain" if least == 2 else "one must remain"

@@ -240,7 +240,7 @@ def test_many_bad_rows_stay_readable():
     ("[1]", "expected a JSON table as text .found a list"),
     ("{", "expected a JSON table"),
     ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
-    ('{"units": [1]}', "units is not a table"),
+    ('{"units": [1]}', "units is no table"),
     ('{"name": [1]}', "name: a list; expected text"),
     ('{"stand_in": 5}', "stand_in: a int; expected text"),
     ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),

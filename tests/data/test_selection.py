@@ -86,6 +86,14 @@ def test_what_belongs_to_a_station_goes_with_it():
     assert kept["mask"].shape == (15, 2)
 
 
+def test_carriers_of_as_many_rows_as_stations_were_taken_by_station():
+    """Read whole they are of rows; with a station left out, rows had those of other rows."""
+    first = {name: long().arrays[name][:4] for name in ("tx_position", "rssi_db")}
+    of_rows = {"station": np.array([0, 0, 1, 2]), "carrier_hz": 1e9 + np.arange(4.0)}
+    kept = keep_stations(Raw({**long().arrays, **first, **of_rows}), [0, 2], "file").raw.arrays
+    assert kept["station"].tolist() == [0, 0, 1] and (kept["carrier_hz"] - 1e9).tolist() == [0, 1, 3]
+
+
 def test_runs_are_rows():
     kept = keep_runs(channels(), ["EXP006"], "file")
     assert set(kept.raw.arrays["run"]) == {"EXP006"}

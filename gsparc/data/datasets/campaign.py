@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -33,8 +33,7 @@ class Campaign(DataModule):
     Args:
         file: what `raw` reads, one or several tables of the same columns; None: what `gsparc data` fetched.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
-        stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
-        **settings: what `reader` takes besides.
+        **settings: of `gsparc.data.selection.Selection`, and what `reader` takes besides.
     """
 
     choice: ClassVar[str]  # of conf/dataset
@@ -42,6 +41,7 @@ class Campaign(DataModule):
     suffixes: ClassVar[tuple[str, ...]] = ()  # of files of the release
     inside: ClassVar[str] = ""  # pattern of a file that folders of the release hold
     switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
+    hands_on = Selection  # whose settings it takes
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
     def __init__(
@@ -49,11 +49,6 @@ class Campaign(DataModule):
         file: str | Path | Sequence[str | Path] | None = None,
         name: str | None = None,
         batch_size: int = 16,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
@@ -61,8 +56,8 @@ class Campaign(DataModule):
         one = str(file) if isinstance(file, str | Path) else Several(file)
         whole = isinstance(one, Several) or "://" in one  # a path would make one of two slashes
         self.file = one if whole else Path(one)
-        self.settings = settings
-        self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
+        part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+        self.settings, self.selection = settings, Selection(**part)
 
     def raw(self) -> Raw:
         """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
@@ -188,8 +183,7 @@ def read_split(folder: Path, count: int | None, problems: Problems, first: int =
     present = [path for path in paths if path.exists()]
     if not present:
         return None
-    if len(present) == 1:
-        absent = next(path for path in paths if path not in present)
+    for absent in {*paths} - {*present}:
         return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
     train, test = (_read_index(path, count, problems, first) for path in paths)
     if train is None or test is None:

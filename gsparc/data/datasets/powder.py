@@ -20,7 +20,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.files import read_text
-from gsparc.data.limits import check_arguments, number
+from gsparc.data.limits import number
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw
 
@@ -60,7 +60,8 @@ def raw_of_powder(
         DataError: no such file, or something in it is missing or wrong; all problems with line and column.
     """
     path = Path(path)
-    check_arguments(locals(), tx_height=number(-np.inf), station_height=number(-np.inf))
+    for name, height in (("tx_height", tx_height), ("station_height", station_height)):
+        number(-np.inf).check(f"dataset.{name}", height)
     if path.suffix.lower() == ".csv":
         raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
     else:

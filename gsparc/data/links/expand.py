@@ -442,18 +442,15 @@ def _stated(check: Checker) -> Georeference | None:
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
-    names = f"{prefix}latitude", f"{prefix}longitude"
-    latitude, longitude = (check.real(name, (None,)) for name in names)
+    latitude = check.real(f"{prefix}latitude", (None,))
+    longitude = None if latitude is None else check.real(f"{prefix}longitude", latitude.shape)
     if latitude is None or longitude is None:
-        return np.zeros(0), np.zeros(0)
-    if len(latitude) != len(longitude):
-        check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
     if fault:
-        check.refuse(names[0], "row {}: {}".format(*fault))
+        check.refuse(f"{prefix}latitude", "row {}: {}".format(*fault))
     return latitude, longitude
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quaternion_to_matrix
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
 from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 
 # Of a station's beam, in the order of `Stations.sector`.
@@ -81,11 +81,9 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
     turned = check.real("station_orientation", (count, 4))
-    if turned is not None and not is_unit(turned).all():
-        row = int(np.flatnonzero(~is_unit(turned))[0])
-        fault = f"row {row}: expected a quaternion (w, x, y, z) of length 1"
-        return check.refuse("station_orientation", fault)
-    rotation = None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
+    rotation = None if turned is None else check.turned("station_orientation", turned, called)
+    if turned is not None and rotation is None:
+        return None
     parts = [check.real(name, (count,)) for name in SECTOR]
     sector = None
     if any(part is not None for part in parts):

@@ -46,11 +46,9 @@ def opened(source: str) -> Iterator[Dataset]:
 def read_parquet(source: str, most: int | None = None) -> Sheet:
     """Read columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
     with opened(source) as files:
-        frame = (files.to_table() if most is None else files.head(most)).to_pandas()
-    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
-    frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
-    if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
-        frame = frame.reset_index(allow_duplicates=True)
+        # Without metadata: columns that pandas sets aside as an index are columns all the same.
+        frame = (files.to_table() if most is None else files.head(most)).to_pandas(ignore_metadata=True)
+    frame = frame.loc[:, [not str(name).startswith("__index_level_") for name in frame.columns]]
     heads = tuple(str(name) for name in frame.columns)
     twice = [name for name in heads if heads.count(name) > 1]
     if twice:
@@ -91,13 +89,11 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
     lines, banner_notes = _without_banner(lines)
     notes += banner_notes
-    excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
-    if excel:  # Excel's own hint
+    if re.fullmatch("sep=.", lines[min(lines)].strip()) and len(lines) > 1:  # Excel's own hint
         del lines[min(lines)]
-        comment = ""
-    delimiter = excel[1] if excel else _delimiter(list(lines.values()), comment)
-    if delimiter is None or not lines:
-        fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
+    delimiter = _delimiter([*lines.values()], comment)
+    if delimiter is None:
+        fault = f"line {min(lines)} ({lines[min(lines)][:40]!r}) is a single column"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     width = len(_cells(lines[min(lines)], delimiter))
     if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:

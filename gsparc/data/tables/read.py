@@ -17,7 +17,7 @@ from gsparc.data.files import Several
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
-from gsparc.data.schema import ENDS
+from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.tables.cells import LOOKED_AT, merged
 from gsparc.data.tables.columns import CHANNELS, JOINED, LEVELS, POLAR, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.heads import LISTS, PERCENT, words_of
@@ -206,13 +206,23 @@ class Builder:
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
         self.zones = self._zones(where)
+        others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
-            self._add_stations(stations, where.degrees)
+            self.arrays["station_name"] = np.array(stations.names)
+            self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
+            others["station"] = stations.places
         # Warnings need the level and the station of each row, so both are known before.
         self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
-        for other in ends.values():  # the end that is left, where there are no stations
-            self._add_other("tx" if moving == "rx" else "rx", other, where)
+        for name, other in others.items():
+            if other.degrees != where.degrees:
+                units = ("degrees", "metres") if where.degrees else ("metres", "degrees")
+                fault = (
+                    f"{units[0]}, those of {ENDS.get(name, 'stations')} in {units[1]}; expected one of them"
+                )
+                return self.refuse(f"the places of rows are in {fault}")
+            still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
+            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
     def _unused(self) -> dict[str, np.ndarray]:
         """Text (S,) of the columns that are not used, those of one value left out."""
@@ -405,24 +415,6 @@ class Builder:
         each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
         names = tuple(f"station {i}" for i in range(len(values)))
         return StationList(names, each, index=index.reshape(-1))
-
-    def _add_stations(self, stations: StationList, degrees: bool) -> None:
-        if stations.places.degrees != degrees:
-            words = ("degrees", "metres") if degrees else ("metres", "degrees")
-            fault = f"the places of rows are in {words[0]}, those of stations in {words[1]}"
-            return self.refuse(f"{fault}; expected one of them")
-        self.arrays["station_name"] = np.array(stations.names)
-        if stations.index is not None:
-            self.arrays["station"] = stations.index.astype(np.int64)
-        self._add_places("station", stations.places)
-        return None
-
-    def _add_other(self, name: str, other: Places, moving: Places) -> None:
-        if other.degrees != moving.degrees:
-            self.refuse("one end is in degrees, the other in metres; expected one of them for both")
-        else:
-            still = len(np.unique(other.all(), axis=0)) == 1
-            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
     def _add_places(self, name: str, where: Places, still: bool = False) -> None:
         """Add positions [m], or degrees and heights."""
