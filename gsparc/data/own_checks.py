@@ -292,27 +292,14 @@ UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this
 
 def is_unit(quaternion: np.ndarray) -> np.ndarray:
     """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...) bool."""
-    return np.abs(_length(quaternion) - 1) <= UNIT_TOLERANCE
-
-
-def _length(quaternion: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.linalg.norm(quaternion, axis=-1)
+        return np.abs(np.linalg.norm(quaternion, axis=-1) - 1) <= UNIT_TOLERANCE
 
 
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
-
-    Raises:
-        ValueError: a quaternion is not finite or its length differs from 1 by more than 1 %.
-    """
-    q = np.asarray(quaternion, dtype=np.float64)
-    if not is_unit(q).all():
-        order = "w, x, y, z" if scalar_first else "x, y, z, w"
-        raise ValueError(f"expected a quaternion ({order}) of length 1, got length {_length(q)!s}")
+    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4) of length 1."""
     # SciPy expects the scalar last and normalises, which removes the rounding of printed digits.
-    if scalar_first:
-        q = np.roll(q, -1, axis=-1)
+    q = np.roll(quaternion, -1, axis=-1) if scalar_first else quaternion
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 

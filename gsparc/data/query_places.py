@@ -129,7 +129,7 @@ def _of_sheet(
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
-    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
+    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
     return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, name, (*notes, *guessed), table)
 
 
@@ -188,6 +188,5 @@ def _as_sheet(source: str, columns: Mapping[str, np.ndarray | None]) -> Sheet:
     for name, values in arrays.items():
         if values.shape not in ((), (count,)):
             raise DataError(f"{source}, {name}: expected {count} values, one a row, found {values.shape}")
-    series = tuple(pd.Series(np.broadcast_to(values, count)) for values in arrays.values())
-    rows = tuple(f"row {i}" for i in range(count))
-    return Sheet(source, tuple(arrays), series, rows, problems=Problems(source))
+    frame = pd.DataFrame({name: np.broadcast_to(values, count) for name, values in arrays.items()})
+    return Sheet(source, frame, tuple(f"row {i}" for i in range(count)), problems=Problems(source))

@@ -85,7 +85,7 @@ def choose(
     used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.understand(head) if head and head not in used_heads else Head()
+        meaning = heads.understand(head) if head not in used_heads else Head()
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
@@ -135,7 +135,7 @@ def choose(
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
         notes += _wide_survey(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
-    unused = [repr(head) for head in sheet.heads if head and head not in used]
+    unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]

@@ -46,18 +46,17 @@ def opened(source: str) -> Iterator[Dataset]:
 def read_parquet(source: str, most: int | None = None) -> Sheet:
     """Read columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
     with opened(source) as files:
-        # Without metadata: columns that pandas sets aside as an index are columns all the same.
-        frame = (files.to_table() if most is None else files.head(most)).to_pandas(ignore_metadata=True)
-    frame = frame.loc[:, [not str(name).startswith("__index_level_") for name in frame.columns]]
-    heads = tuple(str(name) for name in frame.columns)
-    twice = [name for name in heads if heads.count(name) > 1]
-    if twice:
-        raise DataError(f"{source}: two columns are named {twice[0]!r}; rename one")
+        frame = (files.to_table() if most is None else files.head(most)).to_pandas()
+    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
+    frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
+    if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
+        frame = frame.reset_index(allow_duplicates=True)
+    frame.columns = frame.columns.astype(str)
+    for name in frame.columns[frame.columns.duplicated()]:
+        raise DataError(f"{source}: two columns are named {name!r}; rename one")
     if not len(frame):
         raise DataError(f"{source}: no rows")
-    rows = tuple(f"row {i}" for i in range(len(frame)))
-    columns = tuple(frame.iloc[:, i] for i in range(len(heads)))
-    return Sheet(source, heads, columns, rows, problems=Problems(source))
+    return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
 
 
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
@@ -118,8 +117,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
     notes += decimal_notes
-    columns = tuple(frame[i] for i in range(len(heads)))
-    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines)[1:], decimal), notes
+    named = frame.set_axis(heads, axis=1)[[head for head in heads if head]]
+    return Sheet(source, named, tuple(f"line {n}" for n in lines)[1:], decimal), notes
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -351,10 +350,7 @@ def _stacked(parts: list[tuple[Sheet, list[str]]], source: str) -> tuple[Sheet, 
         if set(sheet.heads) != set(first.heads) or sheet.decimal != first.decimal:
             lacking = sorted(set(sheet.heads) ^ set(first.heads))[:3]
             raise DataError(f"{sheet.source}: other columns than {first.source} has: {', '.join(lacking)}")
-    columns = (
-        pd.concat([sheet.columns[sheet.heads.index(head)] for sheet, _ in parts], ignore_index=True)
-        for head in first.heads
-    )
+    frame = pd.concat([sheet.frame[[*first.heads]] for sheet, _ in parts], ignore_index=True)
     rows = tuple(f"{Path(sheet.source).name}, {row}" for sheet, _ in parts for row in sheet.rows)
     notes = list(dict.fromkeys(note for _, own in parts for note in own))
-    return replace(first, source=source, columns=tuple(columns), rows=rows), notes
+    return replace(first, source=source, frame=frame, rows=rows), notes

@@ -190,14 +190,14 @@ class StationList:
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
-    naming = [head for head in sheet.heads if head and understand(head).role == "station"]
+    naming = [head for head in sheet.heads if understand(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam is no measurement, whatever its head says besides.
-    heads = tuple("" if meaning(head) in (*SECTOR, *TILTS) else head for head in sheet.heads)
-    chosen, notes = choose(replace(sheet, heads=heads), {"station": called[0]} if len(called) == 1 else {})
+    others = sheet.frame[[head for head in sheet.heads if meaning(head) not in (*SECTOR, *TILTS)]]
+    chosen, notes = choose(replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {})
     chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
-    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if head and meaning(head))]
+    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if meaning(head))]
     notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station"), notes
@@ -239,7 +239,7 @@ def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
     result: list[tuple[str, ...]] = []
     for head in sheet.heads:
         words = set(words_of(head)) & STATION_WORDS
-        if not head or not words:
+        if not words:
             continue
         result += [(head,)] if head not in used else []
         beside = TOGETHER.get(min(words), set())

@@ -228,7 +228,7 @@ class Builder:
         """Text (S,) of the columns that are not used, those of one value left out."""
         used = {column.head for columns in self.chosen.values() for column in columns}
         # A column of one value tells nothing apart, whatever it is called.
-        words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
+        words = {head: self.sheet.words(head) for head in self.sheet.heads if head not in used}
         return {head: text for head, text in words.items() if (text != text[0]).any()}
 
     def _zones(self, where: Places) -> str:

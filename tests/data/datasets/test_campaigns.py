@@ -78,7 +78,7 @@ def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
 
 
 TECHTILE = {
-    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc: csi_imag, rover_z missing in a Techtile"),
+    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc, csi_imag: missing; expected real numbers (E, C, H)"),
     "one experiment of two": ({"csi_real": (("h", "c"), np.zeros((3, 8)))},
         "csi.nc, csi_imag: expected shape (E, C, H)"),
     "transposed": (

@@ -154,7 +154,7 @@ SPOILT = {
     "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
     "latitude alone": (town(tx_position=None, latitude=np.full(PLACES, 40.0)), "given alone"),
     "beyond the pole": (degrees(np.full(PLACES, 140.0), np.full(PLACES, 4.0)), "row 0: latitude 140"),
-    "counts of degrees": (degrees(WALK[:, 0], WALK[1:, 1]), "9 values for 10"),
+    "counts of degrees": (degrees(WALK[:, 0], WALK[1:, 1]), "here .10,., found .9,"),
     "metres beside degrees": (
         degrees(WALK[:, 0], WALK[:, 1], station_position=POSTS), "in metres beside places in degrees",
     ),
