@@ -38,7 +38,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("scale", "" if scale == 1 else f"stored targets are the measurements divided by {scale:.4g}"),
         ("censored", f"of {len(data)} powers {weak} were too weak, {strong} too strong to be measured"
          if data.censored is not None else ""),
-        ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with a complex factor of its own"),
+        ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
         ("phases", "" if phases is None else str(phases)),
         ("mask", f"{data.mask.mean():.1%} of the entries were measured"
          if data.mask is not None and data.censored is None else ""),
