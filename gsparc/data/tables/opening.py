@@ -184,8 +184,7 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
         named = {cell: bool(understand(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
-        filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
-        above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
+        above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
         if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
             kept = {n: line for n, line in lines.items() if n >= numbers[first]}
             note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
@@ -215,18 +214,17 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 def _delimiter(lines: list[str], comment: str) -> str | None:
     """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
-    best: tuple[bool, float, int, str] | None = None
     sample = lines[:LOOKED_AT]
-    for delimiter in DELIMITERS:
+
+    def suits(delimiter: str) -> tuple[bool, bool, bool, float, int]:
         count = len(_cells(sample[0], delimiter))
         named = _cells(comment, delimiter) if comment else []
         heads = len(named) == count and any(understand(cell).role for cell in named)
-        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
-            continue
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
-        if best is None or (heads, agree, count) > best[:3]:
-            best = (heads, agree, count, delimiter)
-    return None if best is None else best[3]
+        return count > 1, heads, delimiter != " ", agree, count  # spaces may stand in cells
+
+    best = max(DELIMITERS, key=suits)
+    return best if suits(best)[0] else None
 
 
 def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Lines:

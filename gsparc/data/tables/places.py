@@ -226,11 +226,8 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     for name in values[(counts > 1) & (values != "")]:
         rows = " and ".join(sheet.rows[i] for i in np.flatnonzero(names == name)[:2])
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
-    extra = {}
-    for role in PER_STATION:
-        array = chosen[role][0].numbers(sheet) if role in chosen else sectors.get(role)
-        if array is not None:
-            extra[role] = array
+    facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
+    extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
     return StationList(tuple(map(str, names)), coordinates, extra, aliases=tuple(other)), notes
 
 

@@ -146,19 +146,14 @@ class Builder:
         pairs = [self._tones(part) for part in names]
         # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
-        parts: list[list[np.ndarray]] = [[], []]
-        for tone in self.tones.tolist():
-            for i, columns, other in zip((0, 1), pairs, pairs[::-1], strict=True):
-                if tone not in columns:
-                    fault = f"{other[tone].head!r} has no {names[i]} beside it"
-                    self.refuse(f"{fault}; say dataset.columns.{names[i]}=COLUMN")
-                    continue
-                values = columns[tone].numbers(self.sheet)
-                if values is not None:
-                    parts[i].append(values)
+        for name, own, other in zip(names, pairs, pairs[::-1], strict=True):
+            for tone in sorted(set(other) - set(own)):
+                fault = f"{other[tone].head!r} has no {name} beside it"
+                self.refuse(f"{fault}; say dataset.columns.{name}=COLUMN")
+        parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs]
         if self.sheet.problems:
             return
-        first, second = (np.stack(part, axis=1) for part in parts)
+        first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         if names == POLAR:
             # A unit in the head has turned values into degrees by now; without one, over a turn is no radian.
             degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
@@ -356,8 +351,7 @@ class Builder:
         used = {column.head for columns in self.chosen.values() for column in columns}
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
-            close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
-            for head in close:
+            for head in difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6):
                 self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
@@ -376,14 +370,12 @@ class Builder:
         if head is not None:
             self.listed, lacking, said = self.listed.with_lacking(words)
             self.notes += said
-        for word in dict.fromkeys(words[words != ""].tolist()):
-            if word in self.listed.names or word in lacking:
-                continue
-            hint = nearest(word, self.listed.names)
-            place = "the heads"
-            if head is not None:
-                place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
+        known = {"", *self.listed.names, *lacking}
+        for word in [word for word in dict.fromkeys(words.tolist()) if word not in known]:
+            row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
+            place = "the heads" if head is None else f"column {head!r}, {row}"
+            fault = f"{word!r} is no listed station{nearest(word, self.listed.names)}"
+            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None
