@@ -456,7 +456,4 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _moving(check: Checker) -> str:
     """The end that degrees are of: the one with a height, or the one without a position; the receiver."""
-    for end, other in (("tx", "rx"), ("rx", "tx")):
-        if check.given(f"{end}_height") or check.given(f"{other}_position"):
-            return end
-    return "rx"
+    return "tx" if check.given("tx_height", "rx_position") else "rx"
