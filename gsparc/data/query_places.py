@@ -99,8 +99,8 @@ def read_times(path: str | Path) -> np.ndarray | None:
     times = sheet.numbers("time_s")
     sheet.problems.raise_if_any()
     assert times is not None
-    if np.isnan(times).any():
-        raise DataError(f"{path}, time_s, {sheet.rows[int(np.argmax(np.isnan(times)))]}: expected seconds")
+    for row in np.flatnonzero(np.isnan(times)):
+        raise DataError(f"{path}, time_s, {sheet.rows[row]}: no number; expected seconds")
     return times
 
 

@@ -280,7 +280,7 @@ BAD_ARRAYS = {
     "number": ({"station": np.array([0, 7]), "station_name": np.array(["a"])}, r"row 1: 7 is none of the 1"),
     "both": ({"rx_position": np.zeros((2, 3))}, r"found rx_position and latitude"),
     "none": ({"latitude": PLACE[:0], "longitude": PLACE[:0], "rx_height": 1.0}, r"no rows"),
-    "alone": ({"longitude": None}, r"expected rx_position, or latitude and longitude; found longi"),
+    "alone": ({"longitude": None}, r"expected rx_position, or latitude and longitude; found lat"),
 }
 
 
