@@ -157,6 +157,9 @@ def _defaults(parameters: Iterable[inspect.Parameter]) -> dict[str, Any]:
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
     """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
+    own = inspect.signature(kind).parameters.values()
+    if any(p.kind is p.VAR_KEYWORD for p in own) and not hasattr(kind, "reader"):
+        return settings  # it checks them itself
     known, accepted, name = _parameters(kind), dict[str, Any](), settings.get("name")
     needed = {key for key, default in known.items() if default is inspect.Parameter.empty}
     for key, value in settings.items():
