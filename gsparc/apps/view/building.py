@@ -14,8 +14,7 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
-from gsparc.apps.view.crossed import fans
-from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import LIGHT, Site
@@ -31,7 +30,6 @@ DIRECTIONS = 9000  # of a sphere of power, at most
 QUERIES = 16  # places at which Gaussians are asked what they emit
 RANGE_DB = 30.0  # of emissions that are told apart
 RADIUS = 0.08  # of a sphere of power, of the extent of the site
-SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
 BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
 REACH = 0.8  # of the extent, that rays are drawn to at most
 MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
@@ -39,9 +37,7 @@ SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known 
 PATHS = Legend(
     "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
 )
-VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
-    "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
-)  # fmt: skip
+VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
     if building.walls is not None:
         parts += walls_faces(building.walls)
     if measured is not None:
-        parts += _measured_parts(measured, legends, extent)
+        parts.append(_measured_part(measured, legends, extent))
     for name in viewed.stations:
         place = viewed.still(name)
         if place is not None:
@@ -91,15 +87,14 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
     parts += _boxes("box", objects.boxes + origin)
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
-        parts += _cloud_parts(cloud, legends, extent)
-    hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
+        parts.append(_cloud_part(cloud, legends, extent))
     faces = np.array(box_faces(*viewed.box()))
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
     parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
-    return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
+    return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
 
 
 def ground_of(viewed: Viewed, building: Building) -> float:
@@ -113,19 +108,12 @@ def ground_of(viewed: Viewed, building: Building) -> float:
     return min(low)
 
 
-def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
+def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
     chosen = evenly(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
     size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
-    parts: list[Part] = [Points(VALUES, places, legends[VALUES].of(values), size)]
-    if np.isfinite(measured.errors).any():
-        few = np.flatnonzero(np.isfinite(measured.errors))
-        psnr = measured.error_label.startswith("PSNR")
-        legends[ERRORS] = Legend.over(measured.error_label, measured.errors, "magma" if psnr else "magma_r")
-        colours = legends[ERRORS].of(measured.errors[few])
-        parts.append(Points(ERRORS, measured.places[few], colours, 1.4 * size))
-    return parts
+    return Points(VALUES, places, legends[VALUES].of(values), size)
 
 
 def dot_size(places: np.ndarray, extent: float) -> float:
@@ -137,14 +125,10 @@ def dot_size(places: np.ndarray, extent: float) -> float:
     return float(np.clip(apart, extent / 250, extent / 80))
 
 
-def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> list[Part]:
-    legend, colours = cloud_colours(cloud)
-    legends[GAUSSIANS] = legends[SPLATS] = legend
+def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
+    legends[GAUSSIANS], colours = cloud_colours(cloud)
     size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
-    return [
-        Points(GAUSSIANS, cloud.means, colours, size),
-        Splats(SPLATS, cloud.means, cloud.covariances(), colours, SHADE * cloud.opacities),
-    ]
+    return Points(GAUSSIANS, cloud.means, colours, size)
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
@@ -181,7 +165,9 @@ def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
 
 def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
     """Flat faces (C, 3) as triangles."""
-    triangles = fans(faces)
+    # Each face a fan about its first corner.
+    fans = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
+    triangles = np.array(fans).reshape(-1, 3, 3)
     return Faces(
         name, triangles.reshape(-1, 3), np.arange(triangles.size // 3).reshape(-1, 3), colour, opacity
     )

@@ -1,4 +1,4 @@
-"""What is drawn, as plain arrays: points, lines, Gaussians, faces, pictures and marks in world metres."""
+"""What is drawn, as plain arrays: points, lines, faces, pictures and marks in world metres."""
 
 from __future__ import annotations
 
@@ -60,17 +60,6 @@ class Lines:
 
 
 @dataclass(frozen=True)
-class Splats:
-    """Gaussians of means (n, 3) [m], covariances (n, 3, 3) [m^2], colours (n, 3) uint8, opacities (n,)."""
-
-    name: str
-    means: np.ndarray
-    covariances: np.ndarray
-    colours: np.ndarray
-    opacities: np.ndarray
-
-
-@dataclass(frozen=True)
 class Faces:
     """Triangles (f, 3) between vertices (v, 3) [m], in one colour."""
 
@@ -105,7 +94,7 @@ class Mark:
     text: str
 
 
-Part = Points | Lines | Splats | Faces | Sheet | Mark
+Part = Points | Lines | Faces | Sheet | Mark
 
 
 @dataclass(frozen=True)
@@ -118,7 +107,6 @@ class Scene:
         parts: what is drawn.
         ground: height of a grid beneath all [m].
         legends: of parts, by their names.
-        hidden: names of parts that are drawn when asked for.
         notes: what a reader must know, one line each.
     """
 
@@ -127,7 +115,6 @@ class Scene:
     parts: tuple[Part, ...]
     ground: float
     legends: dict[str, Legend] = field(default_factory=dict)
-    hidden: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def part(self, name: str) -> Part | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)
@@ -27,11 +27,6 @@ def draw(api: Any, frame: Frame, part: Part) -> Any:
     if isinstance(part, Lines):
         places, colours = frame.drawn(part.segments), np.repeat(part.colours[:, None], 2, axis=1)
         return api.add_line_segments(name, places, colours, thickness=THICKNESS, thickness_units="screen")
-    if isinstance(part, Splats):
-        return api.add_gaussian_splats(
-            name, frame.drawn(part.means), np.float32(part.covariances * frame.scale**2), part.colours,
-            part.opacities.astype(np.float32)[:, None],
-        )  # fmt: skip
     if isinstance(part, Faces):
         return api.add_mesh_simple(
             name, frame.drawn(part.vertices), part.triangles, color=part.colour, opacity=part.opacity,
@@ -48,10 +43,10 @@ def draw(api: Any, frame: Frame, part: Part) -> Any:
 
 
 def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything that is not hidden at first, in place of the nodes `before`; returns the nodes by name."""
+    """Everything, in place of the nodes `before`; returns the nodes by name."""
     for node in before.values():
         node.remove()
-    return {part.name: draw(api, scene.frame, part) for part in scene.parts if part.name not in scene.hidden}
+    return {part.name: draw(api, scene.frame, part) for part in scene.parts}
 
 
 def path_of(name: str) -> str:
