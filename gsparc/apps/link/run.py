@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.apps.link.adaptation import Rates, Rule
+from gsparc.apps.link.adaptation import Rates
 from gsparc.apps.link.channels import channels, on_band
 from gsparc.apps.link.pusch import RECEIVERS, Pusch, frequency_correlation
 from gsparc.apps.link.study import (
@@ -20,7 +20,6 @@ from gsparc.apps.link.study import (
     curves,
     pusch_facts,
     rate_facts,
-    tradeoff,
     transmit,
 )
 from gsparc.evaluation.open_runs import Opened
@@ -101,7 +100,7 @@ class LinkStudy:
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
         return beam_facts(every.true, every.predicted, accepted)
 
-    def rates(self) -> tuple[dict[Rule, list[Rates]], dict[str, Any]]:
+    def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Rate adaptation at every noise level and its facts."""
         if not self.states_variance:
             text = "%s states no error variance: rates are adapted as if predictions were exact"
@@ -110,7 +109,7 @@ class LinkStudy:
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = adapt(own, other, self.mcs["snr_db"], self.mcs)
+        rates = adapt(own, other, self.mcs)
         return rates, rate_facts(rates, self.accepted)
 
     def send(
@@ -135,8 +134,6 @@ class LinkStudy:
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
             facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
-        trade = tradeoff(blocks, self.score, SHARES)
-        facts |= {f"tradeoff/{modulation}/{name}": value for name, value in trade.items()}
         facts |= {
             "pusch/truth": self.grid.source, "pilots/share_of_slot": pusch.pilot_share,
             # An accepted position needs no pilots at all.
