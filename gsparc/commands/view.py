@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.apps.maps.making import place_of
-from gsparc.apps.view.building import Building, cloud_colours, cloud_of
+from gsparc.apps.view.building import cloud_colours, cloud_of
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, grid_for
 from gsparc.apps.view.viewed import open_viewed
@@ -20,7 +20,6 @@ from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import whole
-from gsparc.data.walls import read_walls
 from gsparc.prediction.timing import peak_memory
 
 log = logging.getLogger(__name__)
@@ -58,11 +57,10 @@ def check(save: Path | None, port: int) -> None:
 
 def view_of(settings: dict[str, Any]) -> SiteView:
     """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
-    plan, walls = plan_of(settings), settings["walls"]
-    building = Building(plan, None if walls is None else read_walls(walls))
+    plan = plan_of(settings)
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, building, grid_for(viewed, settings, plan), at, other)
+    return SiteView(viewed, plan, grid_for(viewed, settings, plan), at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:

@@ -110,7 +110,7 @@ def report(
     shown = [table(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
     if result.inside is None:
-        return facts, shown, [result.promise]
+        return facts, shown, []
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
         f"{result.promise}; {result.each_ms:.3g} ms a snapshot"

@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
@@ -19,41 +18,29 @@ from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.data.walls import SceneWalls, box_faces
+from gsparc.data.walls import box_faces
 
 log = logging.getLogger(__name__)
 
 WORDS = ("transmitter", "receiver")  # that stand still
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
+DOT = 0.008  # width of a measured place, of the extent of the site
 DIRECTIONS = 9000  # of a sphere of power, at most
 QUERIES = 16  # places at which Gaussians are asked what they emit
 RANGE_DB = 30.0  # of emissions that are told apart
 RADIUS = 0.08  # of a sphere of power, of the extent of the site
 BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
 REACH = 0.8  # of the extent, that rays are drawn to at most
-MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
-SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known walls"}
+MIRROR, BOX = (205, 92, 92), (31, 119, 180)
+SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes that were found"}
 PATHS = Legend(
     "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
 )
 VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
-@dataclass(frozen=True)
-class Building:
-    """What is known of a site besides its model.
-
-    Attributes:
-        plan: of the floor, beneath all.
-        walls: known walls and boxes.
-    """
-
-    plan: FloorPlan | None = None
-    walls: SceneWalls | None = None
-
-
-def build(viewed: Viewed, building: Building, station: str | None, measured: Measured | None) -> Scene:
+def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
     points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
@@ -63,13 +50,11 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    ground = ground_of(viewed, building)
-    if building.plan is not None:
-        corners = np.column_stack([building.plan.corners(), np.full(4, ground - BENEATH * extent)])
+    ground = ground_of(viewed)
+    if plan is not None:
+        corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(Sheet("floor plan", corners[0], *edges, building.plan.image))
-    if building.walls is not None:
-        parts += walls_faces(building.walls)
+        parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
     if measured is not None:
         parts.append(_measured_part(measured, legends, extent))
     for name in viewed.stations:
@@ -80,11 +65,11 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
             parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
-    parts += [
-        _mesh(f"mirror {number}", [_square(plane, frame.middle - origin, extent) + origin], MIRROR, 0.12)
-        for number, plane in enumerate(objects.planes)
-    ]
-    parts += _boxes("box", objects.boxes + origin)
+    for number, plane in enumerate(objects.planes):
+        square = _square(plane, frame.middle - origin, extent) + origin
+        parts.append(_mesh(f"mirror {number}", [square], MIRROR, 0.12))
+    for number, box in enumerate(objects.boxes + origin):
+        parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
         parts.append(_cloud_part(cloud, legends, extent))
@@ -97,32 +82,16 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
     return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
 
 
-def ground_of(viewed: Viewed, building: Building) -> float:
-    """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
-    low = [float(viewed.box()[0, 2])]
-    if viewed.site.kind in MAPPED:
-        low.append(viewed.heights()[0])
-    if building.walls is not None:
-        low += [float(face[:, 2].min()) for face in building.walls.faces]
-        low += [float(box[0, 2]) for box in building.walls.boxes]
-    return min(low)
+def ground_of(viewed: Viewed) -> float:
+    """Height beneath which nothing is shown [m]: of measured places and planes."""
+    return min(float(viewed.box()[0, 2]), viewed.heights()[0] if viewed.site.kind in MAPPED else np.inf)
 
 
 def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
     chosen = evenly(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
-    size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
-    return Points(VALUES, places, legends[VALUES].of(values), size)
-
-
-def dot_size(places: np.ndarray, extent: float) -> float:
-    """Width of dots [m]: the distance between neighbours, within bounds that can be seen."""
-    apart = extent / 100
-    if len(places) > 1:
-        distance = cKDTree(places).query(places[:: max(1, len(places) // 2000)], k=2)[0][:, 1]
-        apart = float(np.median(distance[distance > 0])) if (distance > 0).any() else apart
-    return float(np.clip(apart, extent / 250, extent / 80))
+    return Points(VALUES, places, legends[VALUES].of(values), DOT * extent)
 
 
 def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
@@ -164,23 +133,9 @@ def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
 
 
 def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
-    """Flat faces (C, 3) as triangles."""
-    # Each face a fan about its first corner.
+    """Flat faces (C, 3) as triangles, each face a fan about its first corner."""
     fans = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
-    triangles = np.array(fans).reshape(-1, 3, 3)
-    return Faces(
-        name, triangles.reshape(-1, 3), np.arange(triangles.size // 3).reshape(-1, 3), colour, opacity
-    )
-
-
-def walls_faces(walls: SceneWalls) -> list[Part]:
-    """Known walls as one mesh, and boxes."""
-    parts: list[Part] = [_mesh("walls", walls.faces, WALL, 0.4)] if walls.faces else []
-    return parts + _boxes("known box", walls.boxes)
-
-
-def _boxes(name: str, boxes: np.ndarray) -> list[Part]:
-    return [_mesh(f"{name} {number}", box_faces(*box), BOX, 0.35) for number, box in enumerate(boxes)]
+    return Faces(name, np.array(fans).reshape(-1, 3, 3), colour, opacity)
 
 
 @dataclass(frozen=True)

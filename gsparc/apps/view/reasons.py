@@ -22,29 +22,16 @@ def reasons(answer: Answer, moving: str, tree: cKDTree | None) -> list[str]:
     Args:
         answer: a prediction.
         moving: the end that was dragged.
-        tree: of measured places, world (n, 3) [m]; of transmitters and receivers (n, 6) where both moved;
-            None without data.
+        tree: of measured places, world (n, 3) [m]; None without data, or where both ends moved.
     """
     here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
     lines = []
     if there is not None:
         lines.append(f"{float(np.linalg.norm(here - there)):.3g} m from the other end")
     if tree is not None:
-        lines.append(_nearest(answer, here, tree))
-    return lines + _paths(answer)
-
-
-def _nearest(answer: Answer, here: np.ndarray, tree: cKDTree) -> str:
-    if tree.m == 3:
         apart = float(tree.query(here)[0])
-        return "measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away"
-    ends = np.concatenate([answer.ends["tx"], answer.ends["rx"]])
-    # Both ends moved: the row measured with both nearest, in six dimensions.
-    row = tree.data[int(tree.query(ends)[1])]
-    one, two = (float(np.linalg.norm(part)) for part in np.split(row - ends, 2))
-    if max(one, two) < 1e-3:
-        return "measured here"
-    return f"nearest measurement: transmitter {one:.3g} m and receiver {two:.3g} m away"
+        lines.append("measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away")
+    return lines + _paths(answer)
 
 
 def _paths(answer: Answer) -> list[str]:
@@ -72,12 +59,11 @@ ENDS = {"tx": "transmitter", "rx": "receiver"}
 
 def headline(answer: Answer, unit: str = "dB") -> str:
     """Level and confidence in one line."""
-    lines = []
-    if answer.level_db is not None:
-        spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
-        lines.append(f"{answer.level_db:.1f}{spread} {unit}")
-    lines.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
-    return ", ".join(lines)
+    sure = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}"
+    if answer.level_db is None:
+        return sure
+    spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
+    return f"{answer.level_db:.1f}{spread} {unit}, {sure}"
 
 
 def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.building import VALUES, Building, Sphere, build, start_place
+from gsparc.apps.view.building import VALUES, Sphere, build, start_place
 from gsparc.apps.view.plane import Plane, refining
 from gsparc.apps.view.scene import EXTENT, Points, Scene
 from gsparc.apps.view.viewed import Measured, Viewed
@@ -49,14 +50,14 @@ class SiteView:
 
     Attributes:
         viewed: the model.
-        building: floor plan and walls.
+        plan: of the floor, beneath all.
         grid: cells of planes; None where no power is predicted.
         at: world place where the moving end first stands; None: chosen.
         other: the same of the transmitter, where both move.
     """
 
     viewed: Viewed
-    building: Building = field(default_factory=Building)
+    plan: FloorPlan | None = None
     grid: Grid | None = None
     at: np.ndarray | None = None
     other: np.ndarray | None = None
@@ -84,15 +85,11 @@ class SiteView:
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
         measured = viewed.measured(name)
-        scene = build(viewed, self.building, name, measured)
+        scene = build(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
         tree = None
-        if measured is not None and viewed.data is not None:
-            places = measured.places
-            if viewed.site.static_end is None:
-                others = viewed.data.tx[viewed.rows(name)] + viewed.site.origin
-                places = np.column_stack([others, places])
-            tree = cKDTree(places)
+        if measured is not None and viewed.site.static_end is not None:
+            tree = cKDTree(measured.places)
         return StationView(scene, measured, tree, power)
 
     def extent(self, name: str | None) -> float:

@@ -229,7 +229,7 @@ def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
     share = 0.2
     guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
     known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
-    pusch = Pusch("qpsk", 4, 30, known, 8, ["perfect", "lmmse", "predicted", "predicted_pilots"])
+    pusch = Pusch("qpsk", 4, 30, known, 8)
     band = Band(true.contiguous(), guess, doubt)
     wrong = pusch.run(band, 3.0, np.arange(256) % 16, 64).groupby("receiver").failed.mean()
     assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05

@@ -8,7 +8,7 @@ from campaigns import compose
 from towns import town_model
 
 from gsparc.apps.maps.making import levels_at
-from gsparc.apps.view.building import GAUSSIANS, Building, build
+from gsparc.apps.view.building import GAUSSIANS, build
 from gsparc.apps.view.viewed import open_viewed
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
@@ -56,7 +56,7 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
 def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     viewed = open_viewed(town_model(), {"file": str(tmp_path / "gone.npz")})
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
-    scene = build(viewed, Building(), "west", viewed.measured("west"))
+    scene = build(viewed, None, "west", viewed.measured("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,12 @@ import numpy as np
 
 from gsparc.data.raw import Raw, write_raw
 from gsparc.data.schema import LIGHT
-from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
 MOST = 50_000  # instants
 CHUNK = 64  # places that the model answers at once
-OCCUPIED = 0.8  # of the sampling rate: the band over which taps are fitted to paths
-FITTED = 512  # tones in it
-SAME = 1e-3  # of the channels' root mean square: paths that are all of them
+FITTED = 512  # channels that tell where most power arrives
 RIDGE = 1e-4  # of a tap's energy over the tones: what the band does not hold stays small
 
 
@@ -124,8 +121,7 @@ def fitted(
 ) -> Line:
     """Taps of a model's channels along a trajectory, by least squares over the band.
 
-    Over the measured tones, or, where the model's channels are a sum of paths, over `OCCUPIED` of the rate,
-    whatever was measured. The taps stand side by side, where most power arrives.
+    Over the measured tones. The taps stand side by side, where most power arrives.
 
     Args:
         predictor, way: of channels with one end that stands still, and of the other end.
@@ -148,26 +144,14 @@ def fitted(
     places = way.at(time_s)
 
     def ask(place: np.ndarray) -> np.ndarray:
-        if early is not None:
-            one = located_paths(predictor, place, antennas)
-            assert one is not None
-            return one.channel(tones)
         tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))
         return predictor.csi(tx, rx)[:, :antennas]
 
-    early: float | None = None
-    look = places[:: max(len(places) // CHUNK, 1)][:CHUNK]
-    known, rays = ask(look), located_paths(predictor, look, antennas)
-    if rays is not None and np.linalg.norm(rays.channel(tones) - known) < SAME * np.linalg.norm(known):
-        tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
-        # Delays count from `taps` samples before the first path: all are then positive.
-        early = np.floor(rays.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
-        known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
     # No more taps than equations, of which each tone is one.
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
-    first = int(early or 0) + _first(known, turns, taps)
+    first = _first(ask(places[:: max(len(places) // CHUNK, 1)][:CHUNK]), turns, taps)
     columns, solve = _atoms(turns, first, taps)
     gains, left, power = [], [], []
     for start in range(0, len(places), CHUNK):
@@ -181,15 +165,6 @@ def fitted(
         raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
     residual = float(error.sum() / total.sum()), float((error / total).max())
     return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
-
-
-def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
-    """Return paths of the first antennas at places (B, 3) [m, world]; None of a model without paths."""
-    try:
-        paths = predictor.paths(**{predictor.site.moving_end: place})
-    except ValueError:
-        return None
-    return replace(paths, gain=paths.gain[:, :antennas], delay_s=paths.delay_s[:, :antennas])
 
 
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import sheet
 from gsparc.apps.view.reasons import ENDS, headline, legend_html
 from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
-from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.server.draw import draw_scene, first_view, floor
 from gsparc.apps.view.site_view import SiteView, walk
 
 STEPS = 24  # places of the walk, of all stations together
@@ -77,7 +77,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
                 parts.append(Points(SPHERE, around, sphere.colours(answer.spectrum), sphere.size))
             image = panel_image(answer, viewed.site)
             parts += [] if image is None else [_upright(image, scene.frame.middle, extent)]
-            nodes |= {part.name: draw(api, scene.frame, part) for part in parts}
+            nodes |= {part.name: part.draw(api, scene.frame) for part in parts}
             recorder.insert_sleep(PAUSE_S)
             count += 1
     which = ""
@@ -103,7 +103,7 @@ def _still(
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
         level = sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
-        nodes["plane"] = draw(api, scene.frame, level)
+        nodes["plane"] = level.draw(api, scene.frame)
     if len(view.viewed.stations) > 1:
         legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]
     return nodes, legends

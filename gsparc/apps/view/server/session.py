@@ -20,7 +20,7 @@ from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import Plane, refining, sheet, weakest
 from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
 from gsparc.apps.view.scene import EXTENT, Points
-from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.server.draw import draw_scene, first_view, floor
 from gsparc.apps.view.site_view import SiteView
 
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
@@ -66,7 +66,7 @@ class Session:
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
             around = self.scene.frame.middle + self.sphere.offsets
             dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
-            self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
+            self.nodes[SPHERE] = dots.draw(api, self.scene.frame)
 
     def _add_gizmos(self) -> None:
         for end, place in self.places.items():
@@ -122,16 +122,11 @@ class Session:
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
-        notes = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        note = "both ends moved: measured points are where the receiver was, wherever its transmitter"
         if self.site.static_end is not None:
-            notes.append(
-                f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
-            )
-        else:
-            notes.append(
-                "both ends moved: measured points are where the receiver was, wherever its transmitter"
-            )
-        return notes
+            still = ENDS[self.site.static_end]
+            note = f"the {still} stood still when measured: the model knows it there alone"
+        return [*self.scene.notes, f"grid: {self.cell:g} m", note]
 
     def _on(self, handle: Any, act: Any) -> None:
         """Do something with a value that the client changed, not with one that we set."""
@@ -235,7 +230,7 @@ class Session:
                 self.nodes[SPHERE].position = self.scene.frame.drawn(answer.ends["rx"])
                 self.nodes[SPHERE].colors = self.sphere.colours(answer.spectrum)
             for part in rays:
-                self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
+                self.nodes[part.name] = part.draw(self.client.scene, self.scene.frame)
         if rays and first:
             self._legends()
 
@@ -271,7 +266,7 @@ class Session:
             legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
             self.plane, self.power = plane, legend
             part = sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2)
-            self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
+            self.nodes[PLANE] = part.draw(self.client.scene, self.scene.frame)
             if first:
                 self._legends()
             suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
