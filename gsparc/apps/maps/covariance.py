@@ -58,7 +58,7 @@ def unknown_of(
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:
-    """Return error covariances at world places (S, 3) [m] of every station, by its process or predictions.
+    """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
     Held-out blocks of `promise` scale the variances.
 
