@@ -10,10 +10,10 @@ density of rows given their nearest ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -188,6 +188,11 @@ class Nearest(Posterior):
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return nearest_distance(self.near.every, queries)
+
+    def at(self, chosen: np.ndarray, seed: int) -> Self:
+        """Return the same given the places `chosen` alone; the mean law's weights stay as all places say."""
+        near = Neighbourhood.of(self.near.places[chosen], seed)
+        return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""
