@@ -128,21 +128,11 @@ class Fringes:
 
 def fringes_of(state: dict[str, Any]) -> Fringes:
     """Return the fringes whose `state()` this was."""
-    waves, mixture, weights, blind, rows, fold = (
-        state[name].numpy() for name in ("waves", "mixture", "weights", "blind", "rows", "fold")
-    )
-    b = [float(value) for value in state["blend"]]
+    arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
+    basis, b = Basis(arrays.pop("waves"), arrays.pop("mixture")), [float(value) for value in state["blend"]]
     blend = Blend((b[0], b[1]), (b[2], b[3]), (b[4], b[5]))
-    return Fringes(
-        Basis(waves, mixture),
-        weights,
-        blind,
-        rows,
-        fold,
-        float(state["level"]),
-        float(state["wavelength"]),
-        blend,
-    )
+    level, wavelength = float(state["level"]), float(state["wavelength"])
+    return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
 
 
 def sampled(places: np.ndarray, wavelength: float | None) -> bool:
@@ -159,12 +149,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 
 
 def find_fringes(
-    rows: Rows,
-    numbers: np.ndarray,
-    plain: Prior,
-    wavelength: float,
-    seed: int,
-    budget: TimeBudget | None,
+    rows: Rows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
 ) -> tuple[Fringes | None, str]:
     """Return fringes where they pay beside a process, and what must be said of them.
 
@@ -176,7 +161,6 @@ def find_fringes(
         seed: of starts, folds and rows that are drawn.
         budget: how many are sought, and when none is any longer.
     """
-    budget = budget or TimeBudget()
     rng, total = np.random.default_rng(seed), len(rows.places)
     order, probes = rng.permutation(total), total // PROBES
     count = min(total - probes, MOST_ROWS)

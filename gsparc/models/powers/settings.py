@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
@@ -20,14 +19,14 @@ from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
-from gsparc.models.powers.groups import SPREAD, groups
+from gsparc.models.powers.groups import groups
 from gsparc.processes.censored import ConditionalGaussian, Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
-from gsparc.processes.nearest import Values, settings_of
+from gsparc.processes.nearest import Values, given, settings_of
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, trend_of_rows
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
@@ -38,7 +37,7 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON = 500  # of them, constant and distance law; with little effort
+COMPARED_ON = 500  # of them; of more each is then looked at given its nearest
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
@@ -49,14 +48,15 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
-LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
+FREE = 2.0  # parameters that a second length adds
+LOOKS, SETTLED = 40, 5e-6
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -67,9 +67,8 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
-        chosen_on: rows that settings are chosen on, of more.
     """
-    best = chosen_among(rows, _trends(rows, site, mean), seed, chosen_on)
+    best = chosen_among(rows, _trends(rows, site, mean), seed, CHOSEN_ON)
     process, more = conditioned(rows, best.prior, seed)
     return process, (best.description, *best.notes, *more)
 
@@ -113,7 +112,8 @@ def candidates(
     trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
-    found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
+    found = sorted((_settings(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
+    found[0] = _refined(rows, found[0], seed)  # others serve gaps, where near rows of many tell nothing
     return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
 
 
@@ -130,19 +130,18 @@ def mixture(
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
-    Shares of two have the least squared error at squares of floor left out, with a prior on equal ones.
+    Shares have the least squared error at rows left out one by one and at squares of floor left out, both
+    relative to the best candidate's. A prior on equal shares would lose among rows (by 1 % on dense streets).
     """
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
     part = rows.drawn(chosen_on, seed)
     posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
-    gram, count = np.zeros((len(found),) * 2), 0.0
+    # Of all rows: drawn ones are farther apart than those that will answer.
+    gram = _relative([_among_rows(rows.loud, one.prior, seed) for one in found])
     for sides in SIDES:
-        errors = np.stack([_left_out(one, sides) for one in posteriors])
-        gram += errors @ errors.T / errors.shape[1] / len(SIDES)
-        count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
-    gram += gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found))
-    share = _shares_of_two(gram)
+        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SIDES)
+    share = best_weights(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
@@ -150,14 +149,10 @@ def mixture(
     return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
 
 
-def _shares_of_two(gram: np.ndarray) -> np.ndarray:
-    """Shares (K,) of the best two, by products (K, K) of errors: each further one is as many more queries."""
-    tried = []
-    for pair in combinations(range(len(gram)), 2):
-        share = np.zeros(len(gram))
-        share[list(pair)] = best_weights(gram[np.ix_(pair, pair)])
-        tried.append(share)
-    return min(tried, key=lambda share: float(share @ gram @ share))
+def _relative(errors: list[np.ndarray]) -> np.ndarray:
+    """Mean products (K, K) of errors (n,) of K candidates, relative to the square of the best."""
+    gram = np.stack(errors) @ np.stack(errors).T
+    return gram / max(gram.diagonal().min(), np.finfo(float).tiny)
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
@@ -168,15 +163,24 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
     return residual[posterior.extra == 0, 0].numpy()
 
 
+def _among_rows(loud: Rows, prior: Prior, seed: int) -> np.ndarray:
+    """Errors (n,) [dB] at each place, predicted from the nearest others."""
+    values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    return (values.values - given(prior, values, seed).left_out()[0])[:, 0].numpy()
+
+
 def chosen_among(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
-    many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
-    if not many:
+    return _refined(rows, _settings(rows, trends, seed, chosen_on), seed)
+
+
+def _refined(rows: Rows, best: Candidate, seed: int) -> Candidate:
+    """The same with the kernel that many rows call for, each given its nearest."""
+    if len(rows.places) <= COMPARED_ON or rows.silent.any():
         return best
-    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
+    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
     kernel, how = settings_of(best.prior, values, seed)
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
@@ -185,10 +189,8 @@ def _settings(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows if rows.silent.all() else rows.loud
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on, seed))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
-    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
+    few = (rows if rows.silent.all() else rows.loud).drawn(min(chosen_on, COMPARED_ON), seed)
+    weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     scores = [one.score for one in candidates]
@@ -196,14 +198,11 @@ def _settings(
         weighed = _in_doubt(weighed, candidates[-1])
         scores = [_weighed(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
-    if len(loud.places) >= TWO_LENGTHS_NEED and not late():
-        best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not late():
-        # A look at all rows costs several at few: what was found on these is near already.
-        best = _searched(loud, best, [best.kernel], looks=REFINED)
+    if len(few.places) >= TWO_LENGTHS_NEED and not late():
+        best = max(best, _with_two_lengths(few, best), key=lambda one: one.score)
     if both and not late():  # one walk: each look factors several covariances
         best = _weighed(weighed, best, EVIDENCE_LOOKS)
-    count = len((weighed if both else loud).places)
+    count = len((weighed if both else few).places)
     if count < len(rows.places):
         note = f"settings chosen on {count} of {len(rows.places)} rows"
         return replace(best, notes=(*best.notes, note))
@@ -234,9 +233,9 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
+    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
 ) -> tuple[float, Kernel]:
-    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), LOOKS, SETTLED)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
@@ -250,19 +249,14 @@ def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _searched(
-    rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
-) -> Candidate:
-    """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
-    return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
-
-
-def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
-    """Two lengths to start from, about the one that fits best and apart from it."""
-    scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
-    return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+def _with_two_lengths(rows: Rows, one: Candidate) -> Candidate:
+    """The same mean with two lengths, from several about the one that fits best and apart from it."""
+    views = _views(rows, one.trend)
+    scale, length, noise = float(np.median(views[0].numpy())), one.kernel.length, one.kernel.noise
+    starts = [Kernel.matern((length * a, length * b), (0.5, 0.5), noise) for a, b in SPLITS]
+    starts += [Kernel.matern((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
+    value, kernel = _by_left_out(starts, *views)
+    return replace(one, score=-value - one.cost - FREE, kernel=kernel, cost=one.cost + FREE)
 
 
 def _in_doubt(rows: Rows, one: Candidate) -> Rows:
