@@ -37,7 +37,7 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON = 500  # of them; of more each is then looked at given its nearest
+COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
@@ -48,8 +48,7 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SIDES = (10, 5)  # squares along the longer side that are left out
-FREE = 2.0  # parameters that a second length adds
-LOOKS, SETTLED = 40, 5e-6
+LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
@@ -112,8 +111,7 @@ def candidates(
     trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [chosen_among(rows, trends, seed, chosen_on)]
-    found = sorted((_settings(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
-    found[0] = _refined(rows, found[0], seed)  # others serve gaps, where near rows of many tell nothing
+    found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
     return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
 
 
@@ -173,14 +171,11 @@ def chosen_among(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
-    return _refined(rows, _settings(rows, trends, seed, chosen_on), seed)
-
-
-def _refined(rows: Rows, best: Candidate, seed: int) -> Candidate:
-    """The same with the kernel that many rows call for, each given its nearest."""
-    if len(rows.places) <= COMPARED_ON or rows.silent.any():
+    many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
+    best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
+    if not many:
         return best
-    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
+    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
     kernel, how = settings_of(best.prior, values, seed)
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
@@ -189,7 +184,8 @@ def _settings(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    few = (rows if rows.silent.all() else rows.loud).drawn(min(chosen_on, COMPARED_ON), seed)
+    loud = (rows if rows.silent.all() else rows.loud).drawn(chosen_on, seed)
+    few = loud.drawn(COMPARED_ON, seed)
     weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
@@ -199,10 +195,13 @@ def _settings(
         scores = [_weighed(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED and not late():
-        best = max(best, _with_two_lengths(few, best), key=lambda one: one.score)
+        best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
+    if len(loud.places) > len(few.places) and not late():
+        # A look at all rows costs several at few: what was found on these is near already.
+        best = _searched(loud, best, [best.kernel], looks=REFINED)
     if both and not late():  # one walk: each look factors several covariances
         best = _weighed(weighed, best, EVIDENCE_LOOKS)
-    count = len((weighed if both else few).places)
+    count = len((weighed if both else loud).places)
     if count < len(rows.places):
         note = f"settings chosen on {count} of {len(rows.places)} rows"
         return replace(best, notes=(*best.notes, note))
@@ -233,9 +232,9 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor
+    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
 ) -> tuple[float, Kernel]:
-    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), LOOKS, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
@@ -249,14 +248,19 @@ def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _with_two_lengths(rows: Rows, one: Candidate) -> Candidate:
-    """The same mean with two lengths, from several about the one that fits best and apart from it."""
-    views = _views(rows, one.trend)
-    scale, length, noise = float(np.median(views[0].numpy())), one.kernel.length, one.kernel.noise
-    starts = [Kernel.matern((length * a, length * b), (0.5, 0.5), noise) for a, b in SPLITS]
-    starts += [Kernel.matern((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
-    value, kernel = _by_left_out(starts, *views)
-    return replace(one, score=-value - one.cost - FREE, kernel=kernel, cost=one.cost + FREE)
+def _searched(
+    rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
+) -> Candidate:
+    """The same mean with settings of more rows, or with two lengths, for more parameters."""
+    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
+    return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
+
+
+def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
+    """Two lengths to start from, about the one that fits best and apart from it."""
+    scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
+    return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
 def _in_doubt(rows: Rows, one: Candidate) -> Rows:
