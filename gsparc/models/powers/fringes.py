@@ -173,7 +173,7 @@ def find_fringes(
     chosen = np.sort(order[: probes + count])
     every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
     level = 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
-    basis = basis_of(rows.places, wavelength)
+    basis = basis_of(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
