@@ -50,7 +50,6 @@ def undisturbed(tmp_path_factory):
 
 def pytest_addoption(parser):
     parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
-    parser.addoption("--soak-minutes", type=float, help="length of test_soak.py instead of 25 s")
 
 
 def pytest_runtest_setup(item):

@@ -35,11 +35,3 @@ def test_many_layers(backend, opacity):
 
 def test_no_stopping_rule_is_finite_too(backend):
     assert_equals_float64(wall(1.0, n=500), origin(), GRID, backend, cutoff=Cutoff(1 / 255, 0.0))
-
-
-def test_dividing_the_transmittance_back_breaks():
-    """Naive: T before a layer as T after it over 1 - alpha, from the back; it starts from an underflow."""
-    alpha = torch.full((60,), 0.99)
-    behind = torch.prod(1 - alpha)
-    recovered = behind / torch.prod(1 - alpha[1:])
-    assert not torch.isfinite(recovered) or abs(float(recovered) - 0.01) > 0.001

@@ -28,7 +28,6 @@ class Ledger:
             value wanted, and its share of what was allowed.
         tests: outcomes by case.
         counts: by what is counted, then by case.
-        seeds: error of each seed's short run [dB relative to the power] and its seconds, by dataset.
     """
 
     case: str = "other"
@@ -37,7 +36,6 @@ class Ledger:
     errors: list[tuple[str, str, str, str, float, float]] = field(default_factory=list)
     tests: dict[str, Outcome] = field(default_factory=lambda: defaultdict(Outcome))
     counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    seeds: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
@@ -48,13 +46,8 @@ class Ledger:
         self.errors.append((self.case, engine, precision, part, error, error / allowed))
 
     def count(self, what: str, number: int = 1) -> None:
-        """Examples of a property, bad inputs, kills, seeds."""
+        """Examples of a property, bad inputs, kills."""
         self.counts[what][self.case] += number
-
-    def seed(self, dataset: str, figure_db: float, seconds: float) -> None:
-        """The error of one seed's short run [dB relative to the power], and what it took [s]."""
-        self.count("seeds")
-        self.seeds[dataset].append((figure_db, seconds))
 
 
 LEDGER = Ledger()
