@@ -3,26 +3,38 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch as patched
 
 import pytest
 import torch
+import yaml
 from invented import divide, invent
+from omegaconf._utils import get_yaml_loader
+from PIL import Image
 from releases import real
 from threadpoolctl import threadpool_limits
 
 from gsparc.data import executor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation import pictures
+from gsparc.prediction.timing import ClockSettings
 
 threadpool_limits(1, "blas")  # as every command has it
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_spectrum_is_drawn():
-    """Beside its prediction at the end of a training: four took most of a short training's time."""
+def _short_trainings_end_at_once():
+    """Pictures, sixty rounds of timed queries and slow YAML were half of a training of a second."""
+
+    def dot(method, data, fold, title, path):
+        Image.new("L", (1, 1)).save(path)  # what loggers are given
+
+    with patched("yaml.SafeLoader", yaml.CSafeLoader):  # a quarter of what composing a configuration takes
+        loader = get_yaml_loader()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "SPECTRA", 1)
+        patch.setattr("omegaconf._utils.get_yaml_loader", lambda: loader)
+        patch.setattr("gsparc.commands.train.draw_predictions", dot)
+        patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
         yield
 
 

@@ -27,14 +27,6 @@ def backend(request):
         LEDGER.engine = None
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """`train` without its picture, which takes half of the seconds of a short run."""
-    from crashes import DRAWING
-
-    monkeypatch.setattr(DRAWING, lambda *unused: None)
-
-
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
     """Folder of a training that nobody disturbed, its overrides and its length [s]."""

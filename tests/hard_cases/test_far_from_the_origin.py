@@ -16,7 +16,7 @@ FAR = 1e5
 
 
 @pytest.mark.parametrize("moving", ["tx", "rx"])
-def test_a_translated_campaign_predicts_the_same(tmp_path, undrawn, moving):
+def test_a_translated_campaign_predicts_the_same(tmp_path, moving):
     predictors, figures = [], []
     for name, origin in (("near", 0.0), ("far", FAR)):
         file = spectra(tmp_path / f"{name}.npz", moving=moving, origin=origin)

@@ -26,7 +26,7 @@ PRUNE = (
 )
 
 
-def test_pruning_stops_at_the_floor(tmp_path, undrawn):
+def test_pruning_stops_at_the_floor(tmp_path):
     facts, objects = train(compose(*brief(spectra(tmp_path / "own.npz"), *PRUNE)), tmp_path / "run")
     assert facts["model/num_gaussians"] == 5 and np.isfinite(facts["test/psnr_db"])
     opacities = objects.methods[0].fitted().gaussians.opacities

@@ -10,7 +10,7 @@ from campaigns import brief, compose, spectra
 from gsparc.commands.train import train
 
 
-def test_a_pinned_run_repeats(tmp_path, undrawn):
+def test_a_pinned_run_repeats(tmp_path):
     file = spectra(tmp_path / "own.npz")
     states = []
     for name in ("one", "two"):
