@@ -15,7 +15,6 @@ from contexts import trained
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented import invent
-from ledger import LEDGER
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.field.edit import row_parameters
@@ -126,7 +125,6 @@ NASTY = st.sampled_from([0.0, 1.0, -1.0, 1e-45, 1e38, -1e38, math.inf, -math.inf
 @given(count=st.integers(1, 12), draws=st.data())
 def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
     """Gradients that overflowed or are NaN decide who is split; what comes out is finite all the same."""
-    LEDGER.count("examples of properties")
     model, trainer = fresh(count)
     learn(model, trainer.optimizers[0])
     nasty = {

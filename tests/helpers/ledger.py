@@ -3,7 +3,7 @@
 `tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 
@@ -27,7 +27,6 @@ class Ledger:
         errors: case, engine, precision, part ("forward", "backward"), error relative to one plus the largest
             value wanted, and its share of what was allowed.
         tests: outcomes by case.
-        counts: by what is counted, then by case.
     """
 
     case: str = "other"
@@ -35,7 +34,6 @@ class Ledger:
     passes: list[tuple[str, str, str, float]] = field(default_factory=list)
     errors: list[tuple[str, str, str, str, float, float]] = field(default_factory=list)
     tests: dict[str, Outcome] = field(default_factory=lambda: defaultdict(Outcome))
-    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
@@ -44,10 +42,6 @@ class Ledger:
     def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
         """An error against the float64 reference, and what was allowed."""
         self.errors.append((self.case, engine, precision, part, error, error / allowed))
-
-    def count(self, what: str, number: int = 1) -> None:
-        """Examples of a property, bad inputs, kills."""
-        self.counts[what][self.case] += number
 
 
 LEDGER = Ledger()
