@@ -3,11 +3,12 @@
 import shutil
 from collections.abc import Callable
 from copy import deepcopy
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra.core.plugins import Plugins
 from invented import divide, invent
 from PIL import Image
 from releases import real
@@ -24,7 +25,9 @@ threadpool_limits(1, "blas")  # as every command has it
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
     """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
-    read, known = ImportlibResourcesConfigSource._read_config, {}
+    Plugins.instance()  # which imports the class anew
+    found = import_module("hydra._internal.core_plugins.importlib_resources_config_source")
+    read, known = found.ImportlibResourcesConfigSource._read_config, {}
 
     def dot(method, data, fold, title, path):
         Image.new("L", (1, 1)).save(path)  # what loggers are given
@@ -38,7 +41,7 @@ def _short_trainings_end_at_once():
         return deepcopy(known[key])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ImportlibResourcesConfigSource, "_read_config", once)
+        patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
         patch.setattr("gsparc.commands.train.draw_predictions", dot)
         patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
         yield
