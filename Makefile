@@ -17,7 +17,7 @@ DIST ?= dist
 # Its own objects, made anew: those of another compiler would be taken as they are.
 WHEEL ?= -Cbuild-dir=build/wheel/objects
 GRID ?=
-.PHONY: browser grid oracle rare results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
+.PHONY: browser grid oracle rare results help setup sionna cuda docs wheel demo test test-slow hard-cases bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -88,9 +88,6 @@ grid: setup ## every kind of data with defaults beside the plain methods (two ho
 
 oracle: setup ## fixed problems fitted and stored anew (tests/oracle/stored), with what moved, old -> new
 	OMP_NUM_THREADS=1 $(RUN) tests/oracle/stored_fits.py
-
-soak: setup ## half an hour of loads and queries from four threads, with memory watched
-	$(RUN) -m pytest tests/hard_cases/test_soak.py --soak-minutes 30 --timeout 2400 -s
 
 bench: setup ## timings of the kernels as ratios
 	$(RUN) -m gsparc bench

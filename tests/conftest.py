@@ -2,27 +2,48 @@
 
 import shutil
 from collections.abc import Callable
+from copy import deepcopy
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.plugins import Plugins
 from invented import divide, invent
+from PIL import Image
 from releases import real
 from threadpoolctl import threadpool_limits
 
 from gsparc.data import executor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation import pictures
+from gsparc.prediction.timing import ClockSettings
 
 threadpool_limits(1, "blas")  # as every command has it
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_spectrum_is_drawn():
-    """Beside its prediction at the end of a training: four took most of a short training's time."""
+def _short_trainings_end_at_once():
+    """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
+    Plugins.instance()  # which imports the class anew
+    found = import_module("hydra._internal.core_plugins.importlib_resources_config_source")
+    read, known = found.ImportlibResourcesConfigSource._read_config, {}
+
+    def dot(method, data, fold, title, path):
+        Image.new("L", (1, 1)).save(path)  # what loggers are given
+
+    def once(source, file):  # a third of what composing a configuration takes
+        key = source.provider, str(file)
+        if not source.path.startswith(("gsparc.", "hydra.")):  # a plugin's may change
+            return read(source, file)
+        if key not in known:
+            known[key] = read(source, file)
+        return deepcopy(known[key])
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "SPECTRA", 1)
+        patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
+        patch.setattr("gsparc.commands.train.draw_predictions", dot)
+        patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
         yield
 
 

@@ -10,10 +10,10 @@ density of rows given their nearest ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ WHITENED = 1_024  # rows at a time that are whitened by their neighbours
 FIRST = 256  # rows of an ordering that condition on each other alone
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
+LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 LOOKS, SETTLED = 40, 5e-6
@@ -188,6 +189,11 @@ class Nearest(Posterior):
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return nearest_distance(self.near.every, queries)
+
+    def at(self, chosen: np.ndarray, seed: int) -> Self:
+        """Return the same given the places `chosen` alone; the mean law's weights stay as all places say."""
+        near = Neighbourhood.of(self.near.places[chosen], seed)
+        return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
     def state(self) -> dict[str, Any]:
         """See `Posterior`."""
@@ -367,7 +373,7 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     for own in sets:
         row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
         tree = cKDTree(values.places[own])  # the nearest of all is the row itself
-        parts.append(own[tree.query(values.places[row], k=NEIGHBOURS + 1)[1]])
+        parts.append(own[tree.query(values.places[row], k=LOOKED_BY + 1)[1]])
     rows = np.concatenate(parts)
     sample = Sample.of(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
@@ -375,5 +381,5 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     starts = [Kernel.matern((long * share, long), shares, start.noise) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
-    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"
+    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
     return most_likely(starts, sample, scale), f"{note} among {' and '.join(str(len(o)) for o in sets)}"

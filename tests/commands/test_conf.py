@@ -23,14 +23,11 @@ from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, methods
 
 CONF = Path(gsparc.conf.__path__[0])
-GROUPS = ("dataset", "split", "trainer", "callbacks", "logger", "paper", "experiment")  # of train.yaml
-CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
-CHOICES += [f"model={name}" for name in methods()]
-NEEDED = {
-    "dataset=own": ["dataset.file=x.npz"],
-    "dataset=newrf": ["dataset.file=x.npz"],
-    "split=file": ["split.path=split.json"],
-}
+GROUPS = ("dataset", "split", "trainer", "callbacks", "logger")  # of train.yaml
+CHOICES = [sorted(f"{group}={file.stem}" for file in (CONF / group).glob("*.yaml")) for group in GROUPS]
+CHOICES += [[f"model={name}" for name in methods()]]
+OWN = ["dataset=own", "dataset.file=x.npz"]
+NEEDED = {"dataset=own": OWN[1:], "dataset=newrf": OWN[1:], "split=file": ["split.path=split.json"]}
 
 
 def composed(monkeypatch, *overrides: str, command: str = "train"):
@@ -41,18 +38,22 @@ def composed(monkeypatch, *overrides: str, command: str = "train"):
     return config
 
 
-@pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_composes_and_builds(choice, monkeypatch):
-    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
-    group, _, name = choice.partition("=")
-    own = ["dataset=own", "dataset.file=x.npz"] if group == "model" else []
-    config = composed(monkeypatch, choice, *NEEDED.get(choice, own))
+def assert_builds(config) -> None:
     assert isinstance(build(config.model), MethodFactory)
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here
+
+
+@pytest.mark.parametrize("row", range(max(map(len, CHOICES))))
+def test_every_choice_composes_and_builds(row, monkeypatch):
+    """One of each group at once; models without a name: `Interpolation key 'model.name' not found`."""
+    chosen = [choices[row] for choices in CHOICES if row < len(choices)]
+    own = [] if any(one.startswith("dataset=") for one in chosen) else OWN
+    config = composed(monkeypatch, *chosen, *own, *(word for one in chosen for word in NEEDED.get(one, ())))
+    assert_builds(config)
     if own:  # microseconds: no two share one
-        assert re.fullmatch(rf"outputs/own/{name}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
+        assert re.fullmatch(rf"outputs/own/{chosen[-1][6:]}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
 
 
 def said_in(file: Path) -> dict:
@@ -71,6 +72,8 @@ def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
     group, choice = file.relative_to(CONF).parts[0], file.relative_to(CONF / file.relative_to(CONF).parts[0])
     command = "compare" if choice.parts[0] == "results" else "train"
     config = composed(monkeypatch, f"{group}={choice.with_suffix('')}", command=command)
+    if command == "train":
+        assert_builds(config)
     with open_dict(config):
         as_said = OmegaConf.merge(config, said_in(file))
     assert OmegaConf.to_container(as_said) == OmegaConf.to_container(config)

@@ -62,7 +62,3 @@ def test_a_command_of_a_page_ends_well(line, tiny, tmp_path, monkeypatch):
     name, *overrides = line
     answer = knock(main, "gsparc", [name, *tiny.line(name, tuple(overrides), tmp_path / "run")])
     assert answer.status == 0, [text[:300] for text in answer.err[-3:]]
-
-
-def test_most_commands_of_the_pages_are_run():
-    assert len(RUN) > 50

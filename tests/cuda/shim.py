@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
 
 from gsparc.ops import backends, calls, cuda, cuda_library, operators
 
@@ -28,8 +29,10 @@ def fingerprint(*also: str) -> str:
 def library() -> cuda_library.Library:
     """The sources of the kernels, executed by fibers; built when they have changed."""
     path = KEPT / f"{fingerprint()}.so"
-    if not path.exists():
-        cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.cuda_sources(), str(SHIM)])
+    KEPT.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_suffix(".lock")):  # of processes of tests one builds
+        if not path.exists():
+            cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.cuda_sources(), str(SHIM)])
     return cuda_library.Library(path)
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from compute_kernels import KIND_SHAPES, assert_equals_reference
-from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
+from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render, truth
 
 from gsparc.field.losses import _Kernel
 from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, networks, operators, rasterize, similarity
@@ -22,7 +22,7 @@ def crowd(n: int = 700) -> Scene:
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_long_lists_equal_the_reference(where, dtype, projection):
     scene, grid = crowd(), SphereGrid.full_sphere(8, 24)
-    want = render(scene, poses(3), grid, "reference", projection=projection)
+    want = truth(scene, poses(3), grid, projection=projection)
     assert want["transmittance"].min() < 1e-4 < want["transmittance"].max()
     got = render(scene.to(dtype), poses(3), grid, projection=projection)
     assert_close(got, want, 1e-9 if dtype == torch.float64 else 1e-4)

@@ -11,8 +11,7 @@ from gsparc.training.context import FitContext
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
-def test_test_rows_are_drawn(campaign, tmp_path, monkeypatch, kind):
-    monkeypatch.setattr("gsparc.evaluation.pictures.SPECTRA", 4)  # as outside of tests
+def test_test_rows_are_drawn(campaign, tmp_path, kind):
     data = campaign(kind)
     rows = np.arange(len(data))
     fold = Fold(rows[::2], rows[:0], rows[1::2])

@@ -27,14 +27,6 @@ def backend(request):
         LEDGER.engine = None
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """`train` without its picture, which takes half of the seconds of a short run."""
-    from crashes import DRAWING
-
-    monkeypatch.setattr(DRAWING, lambda *unused: None)
-
-
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory):
     """Folder of a training that nobody disturbed, its overrides and its length [s]."""
@@ -50,7 +42,6 @@ def undisturbed(tmp_path_factory):
 
 def pytest_addoption(parser):
     parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
-    parser.addoption("--soak-minutes", type=float, help="length of test_soak.py instead of 25 s")
 
 
 def pytest_runtest_setup(item):

@@ -29,12 +29,9 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def test_ten_kilometres_at_60_ghz_within_a_thousandth_of_a_radian():
-    """Naive float32 is off by radians."""
     exact = np.array([_exact(r, CARRIER) for r in FAR])
     ours = reduced_phase(torch.tensor(FAR, dtype=torch.float64), CARRIER).double().numpy()
     assert _apart(ours, exact).max() < 1e-3
-    naive = -2 * torch.pi * CARRIER * torch.tensor(FAR, dtype=torch.float32) / LIGHT
-    assert _apart(naive.double().numpy(), exact).max() > 0.1
 
 
 def test_backward_is_the_slope_of_the_unreduced_phase():
@@ -43,21 +40,6 @@ def test_backward_is_the_slope_of_the_unreduced_phase():
     phase.sum().backward()
     slope = -2 * torch.pi * CARRIER / LIGHT * torch.tensor([[0.6, 0.8, 0.0]], dtype=torch.float64)
     torch.testing.assert_close(source.grad, slope, rtol=1e-6, atol=1e-6)
-
-
-def test_backward_through_the_wave_by_finite_differences():
-    observer = torch.tensor([[0.3, -0.2, 0.1]], dtype=torch.float64)
-    place = torch.tensor([[700.0, 300.0, 20.0]], dtype=torch.float64, requires_grad=True)
-    wave(ranges(observer, place), CARRIER).real.sum().backward()
-    step = 2e-5  # [m], a 250th of a wavelength
-    for axis in range(3):
-        nudge = torch.zeros(1, 3, dtype=torch.float64)
-        nudge[0, axis] = step
-        with torch.no_grad():
-            ends = [wave(ranges(observer, place + s * nudge), CARRIER).real.double().sum() for s in (1, -1)]
-        assert place.grad[0, axis].item() == pytest.approx(
-            ((ends[0] - ends[1]) / (2 * step)).item(), rel=2e-2, abs=5e-3
-        )
 
 
 @pytest.mark.parametrize("tones", [2, 26, 256])

@@ -2,7 +2,7 @@
 
 Remedy: files appear by renaming (gsparc/data/files.py), errors pass one door (gsparc/commands/shared/cli.py),
 and a thread that computes asks whether to go on (gsparc/processes/worker.py). The disk is a limit on the
-size of files, failing like a full one in the middle of writing. Naive: tests/hard_cases/test_full_disk.py.
+size of files, failing like a full one in the middle of writing.
 """
 
 import re

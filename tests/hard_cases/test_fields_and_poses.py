@@ -14,7 +14,6 @@ import torch
 from fields import CIRCLES, Drawn, assert_within, condition, fields, layers, show
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from ledger import LEDGER
 from rasters import one, origin, render
 
 from gsparc.ops import Cutoff, Pose, SphereGrid, freeze, make_plan, mean_weights
@@ -32,11 +31,10 @@ def holds(fast: int, many: int, **drawn):
 
     def of(check):
         def test(backend, examples):
-            def counted(**values):
-                LEDGER.count("examples of properties")
+            def bound(**values):
                 check(backend, **values)
 
-            settings(max_examples=examples, **plain)(given(**drawn)(counted))()
+            settings(max_examples=examples, **plain)(given(**drawn)(bound))()
 
         test.__name__, test.__doc__ = check.__name__, check.__doc__
         return pytest.mark.parametrize("examples", efforts)(test)

@@ -2,7 +2,7 @@
 
 Remedy: written beside and renamed, so that the good one survives; the error is one line that says which
 file (gsparc/models/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which
-fails like a full disk does: in the middle of writing. Naive: writing in place loses the good one first.
+fails like a full disk does: in the middle of writing.
 """
 
 import errno
@@ -62,13 +62,3 @@ def test_simulation_keeps_its_finished_shards(tmp_path):
     assert left(tmp_path) == ["box.h5.parts", "box.txt", "whole.h5"]
     assert len(list((tmp_path / "box.h5.parts").glob("shard_*.npz"))) == 5
     assert run(simulation, str(out), 20)[0] == 0 and out.read_bytes()
-
-
-def test_writing_in_place_breaks(tmp_path):
-    """Naive: open the good file for writing, then run out of space."""
-    path = tmp_path / "m.ckpt"
-    path.write_bytes(bytes(10_000))
-    with Limited(5_000), pytest.raises(OSError), path.open("wb") as file:
-        file.write(bytes(10_000))
-        file.flush()
-    assert path.stat().st_size < 10_000

@@ -50,12 +50,3 @@ def test_share_follows_the_integral(backend, projection):
 def test_equals_float64(backend, projection, elevation):
     scene = one([math.cos(elevation), 0.1, math.sin(elevation)], distance=FAR, sigma=SIGMA, opacity=0.5)
     assert_equals_float64(scene, origin(), GRID, backend, projection=projection)
-
-
-def test_culling_by_the_mean_breaks():
-    """Naive: nothing once the mean is below the edge. Half of the footprint would go in one step."""
-    below = -GRID.elevation_step / 2 - 1e-6
-    scene = one([math.cos(below), 0.1, math.sin(below)], distance=FAR, sigma=SIGMA, opacity=0.5)
-    got = render(scene, origin(), GRID)
-    naive = 0.0 if below < -GRID.elevation_step / 2 else float(got["image"].sum())
-    assert float(got["image"].sum()) > 5 and naive == 0.0

@@ -1,7 +1,7 @@
 """Near-opaque: a backward pass that recovers the transmittance by dividing by 1 - alpha blows up.
 
 Remedy: alpha is clamped at 0.99 in both passes, with zero gradient when clamped; the backward pass runs front
-to back with the forward's own recurrence (csrc/backward.h). Shown: 30,000 layers, finite, equal to float64
+to back with the forward's own recurrence (csrc/backward.h). Shown: 10,000 layers, finite, equal to float64
 within 1e-9 in float64 and 1e-4 in float32.
 """
 
@@ -16,7 +16,7 @@ from gsparc.ops import Cutoff, SphereGrid
 GRID = SphereGrid(3, 4, 0.1, -0.2, 0.1, 0.1)
 
 
-def wall(opacity: float, n: int = 30_000) -> Scene:
+def wall(opacity: float, n: int = 10_000) -> Scene:
     draw = torch.Generator().manual_seed(4)
     means = torch.cat([torch.linspace(2, 8, n)[:, None], 0.3 * torch.randn(n, 2, generator=draw)], 1)
     means[0] = torch.tensor([1.5, 0.0, 1.5 * math.tan(0.1)])  # nearest, at a pixel's centre: it is clamped
@@ -35,11 +35,3 @@ def test_many_layers(backend, opacity):
 
 def test_no_stopping_rule_is_finite_too(backend):
     assert_equals_float64(wall(1.0, n=500), origin(), GRID, backend, cutoff=Cutoff(1 / 255, 0.0))
-
-
-def test_dividing_the_transmittance_back_breaks():
-    """Naive: T before a layer as T after it over 1 - alpha, from the back; it starts from an underflow."""
-    alpha = torch.full((60,), 0.99)
-    behind = torch.prod(1 - alpha)
-    recovered = behind / torch.prod(1 - alpha[1:])
-    assert not torch.isfinite(recovered) or abs(float(recovered) - 0.01) > 0.001

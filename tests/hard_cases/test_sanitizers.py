@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
-from ledger import LEDGER
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted([*(ROOT / "ops" / "csrc").glob("*.*"), ROOT / "CMakeLists.txt"])
@@ -94,7 +93,6 @@ def test_nothing_is_found(module, isa, others):
     if done.returncode == 99:
         pytest.skip(f"this machine has no {isa}")
     assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
-    LEDGER.count("tests under sanitizers", int(done.stdout.rsplit(" passed", 1)[0].split()[-1]))
 
 
 @pytest.mark.slow

@@ -39,12 +39,3 @@ def test_rows_may_be_permuted(backend, projection):
 @PROJECTIONS
 def test_equals_float64(backend, projection):
     assert_equals_float64(tied(), origin(), GRID, backend, projection=projection)
-
-
-def test_order_by_row_breaks():
-    """Naive: ids ignored, so the row number decides, and permuting rows changes the picture."""
-    scene = replace(tied(), ids=None)
-    order = torch.arange(39, -1, -1)
-    straight = render(scene, origin(), GRID)["image"]
-    mixed = render(scene.permuted(order), origin(), GRID)["image"]
-    assert (straight - mixed).abs().max() > 1e-2

@@ -29,10 +29,3 @@ def test_equals_float64(backend, size):
     scene = random_scene(n=10)
     scene.quats[::2] *= size
     assert_equals_float64(scene.to(torch.float32).to(torch.float64), origin(), GRID, backend)
-
-
-def test_plain_normalising_breaks():
-    """Naive: q / |q|."""
-    q = torch.zeros(4, requires_grad=True)
-    (q / q.norm()).sum().backward()
-    assert q.grad.isnan().any()

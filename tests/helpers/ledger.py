@@ -3,7 +3,7 @@
 `tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 
@@ -27,8 +27,6 @@ class Ledger:
         errors: case, engine, precision, part ("forward", "backward"), error relative to one plus the largest
             value wanted, and its share of what was allowed.
         tests: outcomes by case.
-        counts: by what is counted, then by case.
-        seeds: error of each seed's short run [dB relative to the power] and its seconds, by dataset.
     """
 
     case: str = "other"
@@ -36,8 +34,6 @@ class Ledger:
     passes: list[tuple[str, str, str, float]] = field(default_factory=list)
     errors: list[tuple[str, str, str, str, float, float]] = field(default_factory=list)
     tests: dict[str, Outcome] = field(default_factory=lambda: defaultdict(Outcome))
-    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    seeds: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
@@ -46,15 +42,6 @@ class Ledger:
     def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
         """An error against the float64 reference, and what was allowed."""
         self.errors.append((self.case, engine, precision, part, error, error / allowed))
-
-    def count(self, what: str, number: int = 1) -> None:
-        """Examples of a property, bad inputs, kills, seeds."""
-        self.counts[what][self.case] += number
-
-    def seed(self, dataset: str, figure_db: float, seconds: float) -> None:
-        """The error of one seed's short run [dB relative to the power], and what it took [s]."""
-        self.count("seeds")
-        self.seeds[dataset].append((figure_db, seconds))
 
 
 LEDGER = Ledger()

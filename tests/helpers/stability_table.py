@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import torch
 from ledger import Ledger
@@ -26,7 +25,7 @@ def write(path: Path, ledger: Ledger, folder: Path) -> None:
     """
     text, figures = path.read_text(encoding="utf-8"), _figures(ledger)
     before, rest = text.split(BEGIN)
-    parts = [_conditions(ledger), _kernels(figures), _counts(ledger), _seeds(ledger)]
+    parts = [_conditions(ledger), _kernels(figures)]
     path.write_text(f"{before}{BEGIN}\n{''.join(parts)}{END}{rest.split(END)[1]}", encoding="utf-8")
     for name, table in (("cases", _cases(ledger, folder)), ("kernels", _formatted(figures.reset_index()))):
         table = table.assign(case=table["case"].astype(str).str.replace("_", " "))
@@ -102,28 +101,3 @@ def _kernels(figures: pd.DataFrame) -> str:
         "Worst of all cases: difference to the float64 reference, relative to one plus the largest value,\n"
         "and share of the tolerance. [Case by case, with times](results/hard-cases-kernels.csv).\n\n"
     ) + _markdown(heads, "|---|---|---:|---:|---:|---:|", _formatted(by.reset_index()).to_numpy().tolist())
-
-
-def _counts(ledger: Ledger) -> str:
-    rows = [
-        (
-            what,
-            sum(by_case.values()),
-            ", ".join(f"{c.replace('_', ' ')} {n}" for c, n in sorted(by_case.items())),
-        )
-        for what, by_case in sorted(ledger.counts.items())
-    ]
-    return "\n### Counts\n\n" + _markdown(("what", "how many", "where"), "|---|---:|---|", rows)
-
-
-def _seeds(ledger: Ledger) -> str:
-    rows = []
-    for name, runs in sorted(ledger.seeds.items()):
-        figures, seconds = np.array(runs).T
-        span = f"{figures.min():.2f} to {figures.max():.2f}"
-        rows.append((name, len(runs), f"{np.median(figures):.2f}", span, f"{np.median(seconds):.1f}"))
-    heads = ("dataset", "seeds", "median [dB]", "least to largest [dB]", "s per run")
-    return (
-        "\n### Seeds\n\nError of runs of 15 steps, relative to the power of the target: no figure of merit, "
-        "the runs are there to break.\n\n"
-    ) + _markdown(heads, "|---|---:|---:|---:|---:|", rows)

@@ -60,10 +60,6 @@ def test_phase_after_ten_kilometres_at_60_ghz():
     turns = (60e9 + 120e3 * torch.arange(512, dtype=torch.float64)) * delays
     want = torch.polar(torch.ones(512, dtype=torch.float64), -2 * torch.pi * turns.frac())
     assert (got - want).abs().max() < 1e-4
-    naive = torch.polar(
-        torch.ones(512), -2 * torch.pi * (60e9 + 120e3 * torch.arange(512.0)) * delays.float()
-    )
-    assert (naive - want).abs().max() > 0.1
 
 
 @pytest.mark.parametrize(

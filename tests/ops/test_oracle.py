@@ -45,7 +45,7 @@ class Field:
     grid: SphereGrid
     optics: Optics
 
-    def seen(self, unsure: float = 1e-9) -> list[Seen]:
+    def seen(self, unsure: float) -> list[Seen]:
         """By each pose: all samples by a single one, else each its own."""
         parts = [self.features] if len(self.positions) == 1 else self.features[:, None]
         model = (self.means, self.quats, self.scales, self.opacities, self.extinctions)
@@ -121,8 +121,8 @@ def drawn(number: int) -> Field:
 
 
 @cache
-def wanted(number: int) -> list[Seen]:
-    return drawn(number).seen()
+def wanted(number: int, unsure: float = 1e-9) -> list[Seen]:
+    return drawn(number).seen(unsure)
 
 
 def worst(found: torch.Tensor, want: np.ndarray, certain: np.ndarray) -> float:
@@ -154,10 +154,9 @@ def test_pictures_in_float32(backend, first):
     """A few pixels of nasty fields lie where rounding the input moves them; not one Gaussian may be lost."""
     off = pixels = 0
     for number in range(first, first + TOGETHER, 5):
-        field = drawn(number)
-        raster = field.rendered(backend, torch.float32)
-        for index, want in enumerate(field.seen(unsure=1e-3)):
-            image = raster.image if len(wanted(number)) == 1 else raster.image[index : index + 1]
+        raster = drawn(number).rendered(backend, torch.float32)
+        for index, want in enumerate(wanted(number, 1e-3)):
+            image = raster.image if len(wanted(number, 1e-3)) == 1 else raster.image[index : index + 1]
             assert torch.isfinite(image).all()
             gaps = np.abs(image.double().numpy() - want.image).max((0, 1))
             off += (want.certain & (gaps > 1e-3 * (1 + np.abs(want.image).max(initial=0)))).sum()

@@ -20,10 +20,9 @@ from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
-from gsparc.processes.left_out import left_out, left_out_group
-from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, Rows, conditioned, draw
-from gsparc.processes.prior import Prior
+from gsparc.processes.nearest import Values, given
+from gsparc.processes.powers import Rows, conditioned
+from gsparc.processes.prior import Posterior, Prior
 from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5  # of squares; each solution is blind to one
@@ -129,21 +128,11 @@ class Fringes:
 
 def fringes_of(state: dict[str, Any]) -> Fringes:
     """Return the fringes whose `state()` this was."""
-    waves, mixture, weights, blind, rows, fold = (
-        state[name].numpy() for name in ("waves", "mixture", "weights", "blind", "rows", "fold")
-    )
-    b = [float(value) for value in state["blend"]]
+    arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
+    basis, b = Basis(arrays.pop("waves"), arrays.pop("mixture")), [float(value) for value in state["blend"]]
     blend = Blend((b[0], b[1]), (b[2], b[3]), (b[4], b[5]))
-    return Fringes(
-        Basis(waves, mixture),
-        weights,
-        blind,
-        rows,
-        fold,
-        float(state["level"]),
-        float(state["wavelength"]),
-        blend,
-    )
+    level, wavelength = float(state["level"]), float(state["wavelength"])
+    return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
 
 
 def sampled(places: np.ndarray, wavelength: float | None) -> bool:
@@ -160,12 +149,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 
 
 def find_fringes(
-    rows: Rows,
-    numbers: np.ndarray,
-    plain: Prior,
-    wavelength: float,
-    seed: int,
-    budget: TimeBudget | None,
+    rows: Rows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
 ) -> tuple[Fringes | None, str]:
     """Return fringes where they pay beside a process, and what must be said of them.
 
@@ -177,21 +161,23 @@ def find_fringes(
         seed: of starts, folds and rows that are drawn.
         budget: how many are sought, and when none is any longer.
     """
-    budget = budget or TimeBudget()
-    chosen = draw(rows.silent, MOST_ROWS, seed)
-    tail = f" (of {len(chosen)} of {len(rows.places)} rows)" if len(chosen) < len(rows.places) else ""
-    rows, numbers = rows.at(chosen), numbers[chosen]
-    count, level = len(chosen), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
-    basis = basis_of(rows.places, wavelength)
+    rng, total = np.random.default_rng(seed), len(rows.places)
+    order, probes = rng.permutation(total), total // PROBES
+    count = min(total - probes, MOST_ROWS)
+    tail = f" (of {count} of {total} rows)" if count < total - probes else ""
+    squares, fold = groups(rows.places, SIDES), np.full(total, -1)
+    parts = folds(squares, FOLDS, seed)
+    for k, part in enumerate(parts):
+        fold[part] = k
+    fold[order[:probes]] = -1
+    chosen = np.sort(order[: probes + count])
+    every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
+    level = 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
+    basis = basis_of(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
-    rng, group = np.random.default_rng(seed), groups(rows.places, SIDES)
-    fold = np.full(count, -1)
-    for k, part in enumerate(folds(group, FOLDS, seed)):
-        fold[part] = k
-    fold[rng.permutation(count)[: count // PROBES]] = -1
-    error, distance = _apart(rows, fold, conditioned(rows, plain, seed)[0].exact())
+    error, distance = (one[chosen] for one in _apart(every, [*parts, order[:probes]], plain, seed))
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
@@ -232,19 +218,25 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     return spread * (1 / number - 1 / every)
 
 
-def _apart(rows: Rows, fold: np.ndarray, process: PowerProcess) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (n,) of a process without a row, or its fold, and distances (n,) to what is left [m]."""
-    exact = process.posterior
-    assert isinstance(exact, Exact)
-    inverse, weights = exact.factor.inverse, exact.weights[:, :1]
-    probes, distance = fold < 0, np.zeros(len(fold))
-    # `left_out` is measured less predicted, errors here are predicted less measured.
-    error = np.where(probes, -left_out(inverse, weights)[0][:, 0].numpy(), 0.0)
-    distance[probes] = nearest(rows.places)[probes]
-    for k in range(FOLDS):
-        part, rest = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
-        error[part] = -left_out_group(inverse, weights, torch.from_numpy(part))[0][:, 0].numpy()
-        distance[part] = cKDTree(rows.places[rest]).query(rows.places[part])[0]
+def _apart(rows: Rows, parts: list[np.ndarray], prior: Prior, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (n,) of a process at rows of each part without that part, and distances (n,) to the rest [m].
+
+    Of all rows, as it will answer: at some of them alone it would seem worse than it is.
+    """
+    error, distance = np.zeros((2, len(rows.places)))
+    values = torch.from_numpy(rows.decibels)[:, None]
+    dense = given(prior, Values.of(rows.places, values), seed) if len(rows.places) > MOST_ROWS else None
+    at = None if dense is None else dense.near.every.query(rows.places)[1]
+    for part in parts:
+        known: Posterior
+        if dense is None or at is None:
+            rest = np.setdiff1d(np.arange(len(rows.places)), part)
+            known = conditioned(rows.at(rest), prior, seed)[0].posterior
+        else:
+            known = dense.at(np.setdiff1d(at, at[part]), seed)
+        places = torch.from_numpy(rows.places[part])
+        error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
+        distance[part] = known.distance(places).numpy()
     return error, distance
 
 
@@ -258,8 +250,9 @@ def _blend(
     towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
     excess = _excess_variance(powers, fold, blind)
     shares, left = [], []
-    for chosen in (probes, ~probes):
-        share = _share(error[chosen], towards[chosen], excess[chosen], group[chosen])
+    # Rows of a square left out err together and count as one; probes among rows err alone.
+    for chosen, alike in ((probes, 1.0), (~probes, len(group) / len(np.unique(group)))):
+        share = _share(error[chosen], towards[chosen], excess[chosen], alike)
         # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
@@ -271,12 +264,11 @@ def _blend(
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 
 
-def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, group: np.ndarray) -> float:
+def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, alike: float) -> float:
     """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
-    Rows of one group err together and count as one.
+    So many rows as are `alike` count as one.
     """
-    alike = len(group) / len(np.unique(group))
     noise = alike * max(float((error**2).mean()), 1e-12)
     square = max(float(towards @ towards - excess.sum()), 0.0)
     # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
@@ -20,14 +19,14 @@ from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
-from gsparc.models.powers.groups import SPREAD, groups
+from gsparc.models.powers.groups import groups
 from gsparc.processes.censored import ConditionalGaussian, Sites
 from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
-from gsparc.processes.nearest import Values, settings_of
+from gsparc.processes.nearest import Values, given, settings_of
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw, trend_of_rows
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, trend_of_rows
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
@@ -56,7 +55,7 @@ AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more on
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int = CHOSEN_ON
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -67,9 +66,8 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
-        chosen_on: rows that settings are chosen on, of more.
     """
-    best = chosen_among(rows, _trends(rows, site, mean), seed, chosen_on)
+    best = chosen_among(rows, _trends(rows, site, mean), seed, CHOSEN_ON)
     process, more = conditioned(rows, best.prior, seed)
     return process, (best.description, *best.notes, *more)
 
@@ -130,19 +128,18 @@ def mixture(
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
-    Shares of two have the least squared error at squares of floor left out, with a prior on equal ones.
+    Shares have the least squared error at rows left out one by one and at squares of floor left out, both
+    relative to the best candidate's. A prior on equal shares would lose among rows (by 1 % on dense streets).
     """
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
     part = rows.drawn(chosen_on, seed)
     posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
-    gram, count = np.zeros((len(found),) * 2), 0.0
+    # Of all rows: drawn ones are farther apart than those that will answer.
+    gram = _relative([_among_rows(rows.loud, one.prior, seed) for one in found])
     for sides in SIDES:
-        errors = np.stack([_left_out(one, sides) for one in posteriors])
-        gram += errors @ errors.T / errors.shape[1] / len(SIDES)
-        count += (groups(part.loud.places, sides).max() + 1) / len(SIDES)
-    gram += gram.diagonal().min() / (SPREAD**2 * count) * np.eye(len(found))
-    share = _shares_of_two(gram)
+        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SIDES)
+    share = best_weights(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
@@ -150,14 +147,10 @@ def mixture(
     return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
 
 
-def _shares_of_two(gram: np.ndarray) -> np.ndarray:
-    """Shares (K,) of the best two, by products (K, K) of errors: each further one is as many more queries."""
-    tried = []
-    for pair in combinations(range(len(gram)), 2):
-        share = np.zeros(len(gram))
-        share[list(pair)] = best_weights(gram[np.ix_(pair, pair)])
-        tried.append(share)
-    return min(tried, key=lambda share: float(share @ gram @ share))
+def _relative(errors: list[np.ndarray]) -> np.ndarray:
+    """Mean products (K, K) of errors (n,) of K candidates, relative to the square of the best."""
+    gram = np.stack(errors) @ np.stack(errors).T
+    return gram / max(gram.diagonal().min(), np.finfo(float).tiny)
 
 
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
@@ -166,6 +159,12 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
     group = groups_of(groups(posterior.rows.numpy(), sides))
     residual, _ = left_out(posterior.factor.inverse, posterior.weights, group)
     return residual[posterior.extra == 0, 0].numpy()
+
+
+def _among_rows(loud: Rows, prior: Prior, seed: int) -> np.ndarray:
+    """Errors (n,) [dB] at each place, predicted from the nearest others."""
+    values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    return (values.values - given(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
 def chosen_among(
@@ -185,10 +184,9 @@ def _settings(
     rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows if rows.silent.all() else rows.loud
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on, seed))
-    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
-    weighed = rows.at(draw(rows.silent, min(WEIGHED_ON, chosen_on), seed))
+    loud = (rows if rows.silent.all() else rows.loud).drawn(chosen_on, seed)
+    few = loud.drawn(COMPARED_ON, seed)
+    weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     scores = [one.score for one in candidates]
@@ -196,7 +194,7 @@ def _settings(
         weighed = _in_doubt(weighed, candidates[-1])
         scores = [_weighed(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
-    if len(loud.places) >= TWO_LENGTHS_NEED and not late():
+    if len(few.places) >= TWO_LENGTHS_NEED and not late():
         best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
     if len(loud.places) > len(few.places) and not late():
         # A look at all rows costs several at few: what was found on these is near already.

@@ -20,7 +20,6 @@ import torch
 from campaigns import spectra
 from contexts import loaded
 from doors import assert_refused, knock
-from ledger import LEDGER
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
@@ -80,11 +79,16 @@ def altered(sound: Path, to: Path, **changes: object) -> Path:
     return to
 
 
-def assert_refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
-    """`gsparc.load`, `gsparc evaluate` and `train.py ckpt_path=`."""
+def assert_refused_here(path: Path, says: str) -> None:
+    """By `gsparc.load`, in a line that names the file."""
     with pytest.raises(CheckpointError, match=says) as refused:
         gsparc.load(path)
     assert "\n" not in str(refused.value) and path.name in str(refused.value)
+
+
+def assert_refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
+    """By `gsparc.load` and `gsparc evaluate`."""
+    assert_refused_here(path, says)
     given = [f"ckpt={path}", "dataset.name=own", f"dataset.file={file}", f"hydra.run.dir={run}"]
     assert_refused(knock(evaluate, "evaluate", given), says, run)
 
@@ -101,12 +105,10 @@ def test_nothing_executes(sound, tmp_path, name, place):
     with pytest.raises(CheckpointError, match=r"hostile\.ckpt: .*(could run code|cannot be read)"):
         gsparc.load(path)
     assert not (tmp_path / MARK).exists()
-    LEDGER.count("bad inputs")
 
 
-@pytest.mark.parametrize("name", ["os.system", "eval", "Path.touch"])
-def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
-    path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)[name]})
+def test_commands_refuse_them_in_one_line(sound, tmp_path):
+    path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)["eval"]})
     assert_refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
     given = [
         "dataset=own", f"dataset.file={sound[1]}", f"ckpt_path={path}", f"hydra.run.dir={tmp_path / 'r2'}",
@@ -129,11 +131,7 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
         "nested": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: {config[7:-1]}}}\n",
                    "target": "gsparc.models.baselines.idw.InverseDistance"},
     }.items():  # fmt: skip
-        path = altered(sound[0], tmp_path / f"{name}.ckpt", **changes)
-        with pytest.raises(CheckpointError) as refused:
-            gsparc.load(path)
-        assert "\n" not in str(refused.value) and path.name in str(refused.value)
-        LEDGER.count("bad inputs")
+        assert_refused_here(altered(sound[0], tmp_path / f"{name}.ckpt", **changes), "")
     assert not mark.exists()
 
 
@@ -154,7 +152,7 @@ def nested(width: int, depth: int) -> list:
 @pytest.mark.parametrize(
     "changes,says",
     [
-        ({"version": 99}, "of version 99, this gsparc reads 1; train again"),
+        *(({"version": one}, f"of version {one}, this gsparc reads 1; train again") for one in (99, "1", 0, None)),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"site": None}, "incomplete"),
@@ -170,8 +168,7 @@ def nested(width: int, depth: int) -> list:
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
 def test_content_that_does_not_fit(sound, tmp_path, changes, says):
-    path = altered(sound[0], tmp_path / "odd.ckpt", **changes)
-    assert_refused_everywhere(path, sound[1], tmp_path / "run", says)
+    assert_refused_here(altered(sound[0], tmp_path / "odd.ckpt", **changes), says)
 
 
 def other_files() -> dict[str, bytes]:
@@ -191,13 +188,14 @@ def other_files() -> dict[str, bytes]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", [*other_files(), 0.0, 0.01, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("kind", [*other_files(), "absent", 0.0, 0.01, 0.3, 0.9, 0.999])
 def test_files_of_other_kinds_and_cut_short(sound, tmp_path, kind):
     path, content = tmp_path / "other.ckpt", sound[0].read_bytes()
     cut = isinstance(kind, float)
-    path.write_bytes(content[: int(kind * len(content))] if cut else other_files()[kind])
+    if kind != "absent":
+        path.write_bytes(content[: int(kind * len(content))] if cut else other_files()[kind])
     says = "not a gsparc checkpoint, or cut short" if cut else r"other\.ckpt: "
-    assert_refused_everywhere(path, sound[1], tmp_path / "run", says)
+    assert_refused_here(path, "no such checkpoint" if kind == "absent" else says)
 
 
 def test_an_ordinary_unpickler_would_run_them(tmp_path):

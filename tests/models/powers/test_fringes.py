@@ -12,7 +12,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import PowerField
-from gsparc.models.powers.fringes import Blend, sampled
+from gsparc.models.powers.fringes import Blend, nearest, sampled
 from gsparc.models.powers.waves import basis_of, decibels_of, fit_waves
 from gsparc.ops import Pose
 
@@ -70,6 +70,16 @@ def test_fringes_predict_better_than_the_process_alone(interfering):
     plain.condition(data, np.arange(400))
     errors = [np.mean((db(f.predict(batch).mean) - db(batch.target)) ** 2) for f in (field, plain)]
     assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
+
+
+def test_fringes_were_judged_beside_a_process_of_some_rows(monkeypatch):
+    """A plane of 16,000 rows: 42 % between rows for waves, 2.16 dB, where the process alone has 2.07."""
+    monkeypatch.setattr("gsparc.models.powers.fringes.MOST_ROWS", 150)
+    monkeypatch.setattr("gsparc.models.powers.fringes.ROWS_PER_WAVE", 1)
+    data = plane(400)
+    found = fitted_to(PowerField(), data, np.arange(400))[0].fringes
+    assert found is not None and len(found.rows) == 150 + 40 and (found.fold < 0).sum() == 40
+    assert found.blend.distance[0] < 1.2 * np.median(nearest(data.moving))
 
 
 def test_far_from_all_rows_the_process_is_left_alone(interfering):
