@@ -180,6 +180,23 @@ class Method(MethodFactory):
         """Return the number of Gaussians, sources or stored training samples."""
         return 0
 
+    @property
+    def reducible(self) -> Method | None:
+        """The part of it that answers faster and less accurately when asked to; None: it does so itself."""
+        return None
+
+    def knobs(self) -> tuple[str, ...]:
+        """Return names of the settings of `reduced` that mean something to what was fitted; here none."""
+        return () if self.reducible is None else self.reducible.knobs()
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Return what must be known of training rows (n,) to reduce it; stored with the model."""
+        return {} if self.reducible is None else self.reducible.contributions(data, rows)
+
+    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+        """Return a method that answers with these settings; this one is left as it is."""
+        return self if self.reducible is None else self.reducible.reduced(settings, measured)
+
     def objects(self) -> SiteObjects:
         """Return what it found to stand in the site."""
         return SiteObjects.of()
@@ -293,17 +310,3 @@ class HasGaussians(Protocol):
         Raises:
             ValueError: what was fitted here has none.
         """
-
-
-@runtime_checkable
-class Reducible(Protocol):
-    """Answers faster and less accurately when asked to."""
-
-    def knobs(self) -> tuple[str, ...]:
-        """Return names of the settings that mean something to what was fitted."""
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return what must be known of training rows (n,) to reduce it; stored with the model."""
-
-    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
-        """Return a method that answers with these settings; this one is left as it is."""

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
+from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, apart
@@ -80,12 +81,8 @@ class Values:
     @classmethod
     def of(cls, places: np.ndarray, values: Tensor) -> Values:
         """Average rows at (n, D) with values (n, P) over each place."""
-        unique, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
-        counted = torch.from_numpy(count).to(values.dtype)
-        sums = values.new_zeros(len(unique), values.shape[1]).index_add_(
-            0, torch.from_numpy(group.reshape(-1)), values
-        )
-        return cls(unique, sums / counted[:, None], counted.double())
+        first, mean, count = mean_at_places(places, values.numpy())
+        return cls(places[first], torch.from_numpy(mean), torch.from_numpy(count).double())
 
 
 @dataclass(frozen=True)

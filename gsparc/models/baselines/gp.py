@@ -21,8 +21,8 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
-from gsparc.models.reduced import Filled, MeanOnly, View
-from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
+from gsparc.models.reduced import Filled, MeanOnly
+from gsparc.models.target_rows import entry_variance, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely
@@ -219,37 +219,34 @@ class GaussianProcess(Differentiable, ClosedForm):
         return self._decode(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
+        """See `Method.reduced`."""
         if not isinstance(self.scores, Exact):
             return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return nothing: what a component contributes stands in the process."""
-        return {}
-
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+        """See `Method.reduced`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
             return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
-        count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
-        components: Tensor | slice = slice(
-            None
-        )  # a view: the axes of thousands of images are hundreds of megabytes
+        count, lean = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes))), copy.copy(self)
+        # A view where all are kept: the axes of thousands of images are hundreds of megabytes.
+        weights, chosen = self.scores.weights, slice(None)  # type: Tensor, Any
         if count < len(self.axes):
-            components = self.scores.weights.square().sum(0).topk(count).indices
-        mean, axes, shape = self.mean, self.axes[components], self.shape
+            chosen = weights.square().sum(0).topk(count).indices
+        lean.scores, lean.axes = replace(self.scores, weights=weights[:, chosen]), self.axes[chosen]
         if stride > 1:
-            assert grid is not None
-            parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
-            shape = tuple(parts[0].shape)
-            mean, axes = (part.flatten(-2).contiguous() for part in parts)
-        lean = ReducedMean(self, mean, axes, self.scores, components, shape)
-        return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
+            parts = (
+                part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)
+            )
+            lean.mean, lean.axes = (part.flatten(-2).contiguous() for part in parts)
+            lean.shape = tuple(-(-side // stride) for side in self.shape)
+        lean.seen = len(lean.axes)
+        means = MeanOnly(lean, lean.mean_at)
+        return Filled(means, grid, stride) if stride > 1 and grid is not None else means
 
     def _learned(self) -> dict[str, Any]:
         if self.powers is not None:
@@ -304,46 +301,3 @@ def kernel_given_nearest(
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note
-
-
-class ReducedMean(View):
-    """The mean of a Gaussian process, without its variance.
-
-    Args:
-        inner: fitted.
-        mean, axes: (P,) and (C, P), the basis of targets.
-        scores: what the rows say of components; `components` of them.
-        components: see there.
-        shape: of a target.
-    """
-
-    def __init__(
-        self,
-        inner: GaussianProcess,
-        mean: Tensor,
-        axes: Tensor,
-        scores: Exact,
-        components: Tensor | slice,
-        shape: tuple[int, ...],
-    ) -> None:
-        super().__init__(inner)
-        assert inner.site is not None
-        self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
-        self._mean, self._axes = mean, axes
-        self._weights = scores.weights[:, components].float().contiguous()
-        self._middle = scores.rows.mean(0).float()
-        self._scale = math.sqrt(3) / float(scores.prior.kernel.length)
-        self._places = (scores.rows.float() - self._middle) * self._scale
-
-    @torch.no_grad()
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`; Matern-3/2 in float32."""
-        where = self._site.moving(query.tx, query.rx).expand(len(query), -1)
-        scaled = (where - self._middle) * self._scale
-        far = torch.linalg.vector_norm(scaled[:, None] - self._places, dim=-1)  # cdist: three times slower
-        scores = ((1 + far) * torch.exp(-far)) @ self._weights
-        return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
-
-    def size(self) -> int:
-        """Return the number of components kept."""
-        return len(self._axes)

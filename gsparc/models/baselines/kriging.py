@@ -23,6 +23,7 @@ from scipy.spatial.distance import cdist, pdist
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.processes.averages import mean_at_places
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
 SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels
@@ -104,10 +105,11 @@ class Kriging(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Repeated places would make the system singular: their mean is kriged.
-        self.positions, group = np.unique(positions, axis=0, return_inverse=True)
-        decibels, group = self._decibels(targets), group.reshape(-1)
-        self.values = _by_place(decibels, group)
-        self.channels = _by_place(targets.reshape(len(targets), -1), group) if self.kind == "csi" else None
+        decibels, self.channels = self._decibels(targets), None
+        first, self.values, _ = mean_at_places(positions, decibels)
+        self.positions = positions[first]
+        if self.kind == "csi":
+            self.channels = mean_at_places(positions, targets.reshape(len(targets), -1))[1]
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
@@ -209,11 +211,3 @@ class Kriging(Interpolator):
         self.channels = state["channels"].numpy() if "channels" in state else None
         self.variogram = Variogram(*(float(v) for v in state["variogram"]))
         self._solve()
-
-
-def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Means (P, D) of rows (n, D) of the same place (n,)."""
-    total = np.zeros((place.max() + 1, rows.shape[1]), np.result_type(rows, np.float64))
-    np.add.at(total, place, rows)
-    mean = total / np.bincount(place)[:, None]
-    return mean.astype(np.complex64 if np.iscomplexobj(rows) else np.float32)

@@ -26,11 +26,10 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.each_or_together import LearnsTogether
-from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, Reducible
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import comparable, explained
-from gsparc.models.reduced import ReducedByPart
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
@@ -43,7 +42,7 @@ from gsparc.training.time_budget import less_repeatable
 log = logging.getLogger(__name__)
 
 
-class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
+class Mixture(LearnsTogether, ClosedForm):
     """The weighed mean of solutions whose weights follow from the rows: no single one need be the right one.
 
     Initialisers find them, held-out groups weigh them. Subclasses say what is solved for which kind of site.
@@ -282,8 +281,8 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
 
     @property
     def reducible(self) -> Method | None:
-        """See `ReducedByPart`; what answers faster knows nothing of runs' factors."""
-        return self.only if len(self.runs) == 1 and isinstance(self.only, Reducible) else None
+        """See `Method.reducible`; what answers faster knows nothing of runs' factors."""
+        return self.only if len(self.runs) == 1 else None
 
     def parts(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""

@@ -131,13 +131,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`; searches where there are several."""
+        """See `Method.reduced`; searches where there are several."""
         own = ("keep", "stride", "confidence")
         return ("searches", *own) if len(self.trends) > 1 else own
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return nothing: the process itself holds what each component contributes."""
-        return {}
 
     reduced = reduced
 

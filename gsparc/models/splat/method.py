@@ -420,7 +420,7 @@ class LearnedField(Method):
     # -- what it can do besides ----------------------------------------------------------------------
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
+        """See `Method.reduced`."""
         return reduce.knobs(self.fitted())
 
     contributions = reduce.contributions
