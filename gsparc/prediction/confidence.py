@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from gsparc.models.target_rows import training_targets
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, joined
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
+from gsparc.processes.stored import Stored, restored, stored
 
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
@@ -102,7 +103,7 @@ KEY = "confidence"
 
 
 @dataclass(frozen=True)
-class Trusted:
+class Trusted(Stored):
     """The confidence that was best on positions set aside, and a threshold that promises something.
 
     Attributes:
@@ -169,19 +170,12 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    kernel = None if trusted.kernel is None else trusted.kernel.state()
-    checkpoint.amend(path, {KEY: {**asdict(trusted), "kernel": kernel}})
+    checkpoint.amend(path, {KEY: stored(trusted)})
 
 
 def trusted_of(extra: Mapping[str, Any]) -> Trusted:
     """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
-    state = extra.get(KEY)
-    if state is None:
-        return Trusted()
-    promise = None if state["promise"] is None else Guarantee(**state["promise"])
-    kernel = None if state["kernel"] is None else Kernel.read(state["kernel"])
-    known = np.asarray(state["known"], np.float64)
-    return Trusted(state["kind"], float(state["threshold"]), promise, known, kernel)
+    return restored(extra[KEY]) if KEY in extra else Trusted()
 
 
 def threshold_of(kind: str, threshold: Threshold) -> float:

@@ -19,6 +19,7 @@ from scipy.stats import binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.data.splits import far_apart
+from gsparc.processes.stored import Stored
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
@@ -61,7 +62,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
 
 
 @dataclass(frozen=True)
-class Guarantee(Checked):
+class Guarantee(Stored, Checked):
     """What is promised.
 
     >>> Guarantee(alpha=0.1, delta=0.1).least  # 0.9^22 is below 0.1

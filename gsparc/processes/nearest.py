@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import torch
@@ -185,19 +184,6 @@ class Nearest(Posterior):
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return nearest_distance(self.near.every, queries)
-
-    def state(self) -> dict[str, Any]:
-        """See `Posterior`."""
-        arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
-        parts = {name: getattr(self, name) for name in ("rest", "noise", "terms", "spread")}
-        return {"prior": self.prior.state(), **arrays, **parts, "most": self.most}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Nearest:
-        """Return the posterior whose `state()` this was."""
-        near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
-        rest, noise, terms, spread = (state[name] for name in ("rest", "noise", "terms", "spread"))
-        return cls(Prior.read(state["prior"]), near, rest, noise, terms, spread, int(state["most"]))
 
 
 def given(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsparc.ops.transforms import followed, numbers
 from gsparc.processes.kernel import apart
+from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets
@@ -57,7 +58,7 @@ def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class Neighbourhood(Stored):
     """Places in sets that are ever sparser and cover the site.
 
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -17,8 +17,9 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior, posterior_of
+from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Law, Trend
 
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
@@ -87,7 +88,7 @@ def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
 
 
 @dataclass(frozen=True)
-class PowerProcess:
+class PowerProcess(Stored):
     """A process of powers given rows, or several whose weighed mean is the answer.
 
     Attributes:
@@ -176,17 +177,6 @@ class PowerProcess:
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
-
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `read` needs."""
-        others = [{**one.state(), "share": share} for share, one in self.others]
-        return {"posterior": self.posterior.state(), "heard": self.heard, "others": others}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> PowerProcess:
-        """Return the process whose `state()` this was."""
-        others = tuple((float(one["share"]), cls.read(one)) for one in state["others"])
-        return cls(posterior_of(state["posterior"]), float(state["heard"]), others)
 
 
 def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -186,6 +185,7 @@ class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
+    stored = ("law",)
     uses_censored = True
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -212,9 +212,3 @@ class DistanceLaw(Differentiable):
         mean = self._decode(self.law.mean(queries)[:, None].to(dtype))
         variance = torch.full((len(queries),), law_variance(self.law), dtype=dtype)
         return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
-
-    def _learned(self) -> dict[str, Any]:
-        return self.law.state()
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        self.law = Law.read(state)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
+from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 
@@ -116,7 +116,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     """
 
     name = "gp"
-    stored = ("mean", "axes", "lost")
+    stored = ("mean", "axes", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
     count = 0  # type: ignore[assignment]
@@ -234,9 +234,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count, lean = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes))), copy.copy(self)
         # A view where all are kept: the axes of thousands of images are hundreds of megabytes.
-        weights, chosen = self.scores.weights, slice(None)  # type: Tensor, Any
-        if count < len(self.axes):
-            chosen = weights.square().sum(0).topk(count).indices
+        every, weights = slice(None), self.scores.weights
+        chosen = weights.square().sum(0).topk(count).indices if count < len(self.axes) else every
         lean.scores, lean.axes = replace(self.scores, weights=weights[:, chosen]), self.axes[chosen]
         if stride > 1:
             parts = (
@@ -247,20 +246,6 @@ class GaussianProcess(Differentiable, ClosedForm):
         lean.seen = len(lean.axes)
         means = MeanOnly(lean, lean.mean_at)
         return Filled(means, grid, stride) if stride > 1 and grid is not None else means
-
-    def _learned(self) -> dict[str, Any]:
-        if self.powers is not None:
-            return {"powers": self.powers.state()}
-        assert self.scores is not None
-        return {**super()._learned(), "scores": self.scores.state()}
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        self.powers, self.scores = None, None
-        if "powers" in state:
-            self.powers = PowerProcess.read(state["powers"])
-            return
-        super()._relearn(state)
-        self.scores = posterior_of(state["scores"])
 
 
 def projected(

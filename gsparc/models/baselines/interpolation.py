@@ -14,6 +14,7 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import from_real, heard, left_out_note, training_targets
+from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -110,12 +111,12 @@ class Interpolator(Method):
         """Predict at (B, 3) float64 [m]."""
 
     def _learned(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.stored}
+        return {name: stored(getattr(self, name, None)) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
         """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
-            setattr(self, name, state[name])
+            setattr(self, name, restored(state[name]))
 
 
 class Differentiable(Interpolator):

@@ -24,6 +24,7 @@ from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
 from gsparc.processes.averages import mean_at_places
+from gsparc.processes.stored import Stored
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
 SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels
@@ -38,7 +39,7 @@ JITTER = 1e-9  # of the variance, only so that a system without nugget can be so
 
 
 @dataclass(frozen=True)
-class Variogram:
+class Variogram(Stored):
     """`nugget + sill (1 - exp(-distance / range))` beyond distance 0, where it is 0.
 
     Attributes:
@@ -95,6 +96,7 @@ class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
+    stored = ("positions", "values", "variogram", "channels")
     system: tuple[np.ndarray, np.ndarray] | None = None
     tree: cKDTree | None = None
 
@@ -197,17 +199,6 @@ class Kriging(Interpolator):
         unknown = (variance / self.variogram.total).clamp(0, 1)
         return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
 
-    def _learned(self) -> dict[str, Any]:
-        v = self.variogram
-        return {
-            "positions": torch.from_numpy(self.positions),
-            "values": torch.from_numpy(self.values),
-            "variogram": [v.nugget, v.sill, v.range],
-            **({} if self.channels is None else {"channels": torch.from_numpy(self.channels)}),
-        }
-
     def _relearn(self, state: dict[str, Any]) -> None:
-        self.positions, self.values = state["positions"].numpy(), state["values"].numpy()
-        self.channels = state["channels"].numpy() if "channels" in state else None
-        self.variogram = Variogram(*(float(v) for v in state["variogram"]))
+        super()._relearn(state)
         self._solve()

@@ -31,8 +31,9 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
-from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
+from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -176,13 +177,12 @@ class ComplexGP(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"posterior": self._fitted().state(), **self.runs.state(), "shape": list(self.shape)}
+        return {"posterior": stored(self._fitted()), "runs": stored(self.runs), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.posterior = posterior_of(state["posterior"])
-        self.runs = RunFactors.read(state)
+        self.posterior, self.runs = restored(state["posterior"]), restored(state["runs"])
 
     def size(self) -> int:
         """Return the number of training samples kept."""

@@ -26,6 +26,7 @@ from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
@@ -269,7 +270,7 @@ class ChannelField(ClosedForm):
             "prior": self.prior.state(),
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
-            **self.runs.state(),
+            "runs": stored(self.runs),
             "groups": [group.state(self.runs.factors) for group in groups],
         }
 
@@ -278,5 +279,5 @@ class ChannelField(ClosedForm):
         antennas, tones = (int(n) for n in state["channel"])
         self.site, self.channel = site, (antennas, tones)
         self.prior, self.rows = ChannelPrior.read(state["prior"]), state["rows"].numpy()
-        runs = RunFactors.read(state)
+        runs = restored(state["runs"])
         self._solve(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from gsparc.data.instantiate import find
-from gsparc.processes.term import Columns, restored, stored
+from gsparc.processes.term import Columns
 
 
 def columns_of(entry: Any) -> Columns:
@@ -48,12 +48,3 @@ class InWorld(Columns):
         """See `Columns`; of places in local coordinates."""
         # Places are of one end (n, 3), or of both (n, 6).
         return self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
-
-    def state(self) -> dict[str, Any]:
-        """See `Term`."""
-        return {"term": stored(self.term), "origin": self.origin}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> InWorld:
-        """See `Term`."""
-        return cls(restored(state["term"]), state["origin"])
