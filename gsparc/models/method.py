@@ -263,6 +263,12 @@ def suited_threads(method: Method, places: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def answered(method: Method, query: Query) -> Prediction:
+    """Return what a method predicts, by as many threads as suit the query."""
+    with suited_threads(method, len(query)):
+        return method.predict(query)
+
+
 @runtime_checkable
 class Reconditions(Protocol):
     """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""

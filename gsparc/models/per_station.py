@@ -334,6 +334,11 @@ class OfStation(View):
         super().__init__(inner)
         self.number = number
 
+    def joint(self) -> HasJoint | None:
+        """Return what knows how levels of stations go together; None where nothing does."""
+        method = getattr(self.inner, "only", None)
+        return method if isinstance(method, HasJoint) else None
+
     def gradient_problem(self) -> str | None:
         """Return that of all stations."""
         return self.inner.gradient_problem()
@@ -349,11 +354,6 @@ class OfStations(OfStation):
     def __init__(self, inner: Method, count: int) -> None:
         super().__init__(inner, UNHEARD)
         self.count = count
-
-    def joint(self) -> HasJoint | None:
-        """Return what knows how levels of stations go together; None where nothing does."""
-        method = getattr(self.inner, "only", None)
-        return method if isinstance(method, HasJoint) else None
 
     def predict(self, query: Query) -> Prediction:
         """Mean and variance (B, T); the ends that stand are not read."""
