@@ -1,9 +1,13 @@
-"""Means of what was measured at one place."""
+"""Means of what was measured at one place, and of what members of a mixture say."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import torch
 from scipy.sparse import csr_array
+from torch import Tensor
 
 
 def mean_at_places(
@@ -31,3 +35,20 @@ def mean_at_places(
     heard = count[:, None] if measured is None else members @ measured.reshape(flat.shape)
     total = members @ (flat if measured is None else np.where(measured.reshape(flat.shape), flat, 0))
     return first, (total / np.maximum(heard, 1).astype(kind)).reshape(-1, *values.shape[1:]), count
+
+
+def mixture(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Return mean (n, ...) and variance (n,) of a mixture of shares, means (n, ...) and variances (n,).
+
+    What the members disagree about is part of the variance, mean over entries (law of total variance).
+
+    >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
+    >>> mixture([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
+    (tensor([-75.]), tensor([29.]))
+    """
+    if len(parts) == 1:
+        return parts[0][1:]
+    mean = torch.stack([share * one for share, one, _ in parts]).sum(0)
+    apart = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
+    spread = [share * (own + off) for (share, _, own), off in zip(parts, apart, strict=True)]
+    return mean, torch.stack(spread).sum(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import mixture
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, propagate
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
@@ -131,7 +131,7 @@ class PowerProcess(Stored):
         """
         if self.others:
             parts = [(share, *one.answer(queries)) for share, one in self.members]
-            mean, variance = averaged([part[:3] for part in parts])
+            mean, variance = mixture([part[:3] for part in parts])
             return mean, variance, sum((part[0] * part[3] for part in parts), torch.zeros_like(mean))
         result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
@@ -165,7 +165,7 @@ class PowerProcess(Stored):
             exact = one.posterior if isinstance(one.posterior, Exact) else None
             heard = torch.from_numpy(at) if exact is None else exact.extra == 0
             parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
-        return averaged(parts)
+        return mixture(parts)
 
     def exact(self) -> PowerProcess:
         """Return the first alone, with covariances between places; of many rows, given some of them."""
@@ -177,21 +177,6 @@ class PowerProcess(Stored):
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
-
-
-def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Return mean and variance (n,) of a mixture of (share, mean, variance), disagreement of means included.
-
-    >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
-    >>> averaged([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
-    (tensor([-75.]), tensor([29.]))
-    """
-    if len(parts) == 1:
-        return parts[0][1:]
-    mean = sum((share * one for share, one, _ in parts), torch.zeros_like(parts[0][1]))
-    # The law of total variance: within the members, and between their means.
-    spread = [share * (variance + (one - mean).square()) for share, one, variance in parts]
-    return mean, torch.stack(spread).sum(0)
 
 
 def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:

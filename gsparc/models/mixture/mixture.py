@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
+from gsparc.processes.averages import mixture
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -233,27 +234,20 @@ class Mixture(LearnsTogether, ClosedForm):
         if len(result) == 1:
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
-        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        spreads, shares = [], []
-        for weight, one in pairs:
-            assert one.variance is not None and one.unknown is not None
-            # Of a mixture: the mean of variances plus the variance of means (law of total variance).
-            apart = (one.mean - mean).abs().square().flatten(1).mean(1)
-            spreads.append(weight * (one.variance + apart))
-            shares.append(weight * one.unknown)
+        # Members are in closed form, and state both.
+        mean, variance = mixture([(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs])
+        unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
-        variance, unknown = (torch.stack(each).sum(0).to(mean.real.dtype) for each in (spreads, shares))
+        variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
     def left_out(self) -> LeftOutRows:
-        """Return the mean of all."""
+        """Return the mean of all; what they disagree about is part of its variance."""
         result = [member.left_out() for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
-        pairs = list(zip(self.weights, result, strict=True))
-        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)
-        return LeftOutRows(result[0].rows, mean, variance)
+        parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]
+        return LeftOutRows(result[0].rows, *mixture(parts))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""

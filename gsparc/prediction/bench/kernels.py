@@ -47,28 +47,6 @@ def plan(scene: Scene, batch: int) -> Case:
     )
 
 
-def static(scene: Scene, batch: int) -> Case:
-    """Time a static receiver's plan made once: blend (kernel); emission too (whole)."""
-    pose = receiver()
-    layout = scene.plan(pose)
-    features = scene.features.expand(batch, -1, -1).contiguous()
-    tx = places(batch) + 1
-
-    def whole() -> Tensor:
-        values = scene.model.features(tx, pose if batch == 1 else Pose.identity(places(batch)))
-        return composite(layout, *scene.geometry, values).image
-
-    # The view of a static receiver is one, whatever the batch: so is the dense plan.
-    dense = scene.plan(pose, backend="reference") if _dense_bytes(scene, 1) <= REFERENCE_BYTES else None
-    return Case(
-        *("forward, static receiver", scene.projection, len(scene), batch),
-        work=_blending(scene, pose, batch * COMPLEX),
-        kernel=lambda: composite(layout, *scene.geometry, features).image,
-        whole=whole,
-        **_reference(scene, 1, lambda: dense and composite(dense, *scene.geometry, features).image),
-    )
-
-
 def frozen(scene: Scene, batch: int) -> Case:
     """Time a static receiver's weights as a sparse matrix: multiply (kernel); its emissions too (whole)."""
     pose = receiver()
