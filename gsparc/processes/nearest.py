@@ -26,7 +26,7 @@ from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance, with_nearest
 from gsparc.processes.prior import Answer, Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
@@ -348,9 +348,8 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
     for own in sets:
-        row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
-        tree = cKDTree(values.places[own])  # the nearest of all is the row itself
-        parts.append(own[tree.query(values.places[row], k=NEIGHBOURS + 1)[1]])
+        row = covering(values.places[own], LOOKED_AT // len(sets), seed)
+        parts.append(own[with_nearest(values.places[own], row)])
     rows = np.concatenate(parts)
     sample = Sample.of(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])

@@ -130,6 +130,17 @@ class Neighbourhood(Stored):
         return np.concatenate(result, 1)
 
 
+def with_nearest(places: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Return rows (T, 1 + k): each of `row` (T,), then its nearest others among places (n, D).
+
+    >>> with_nearest(np.array([[0.0], [3.0], [1.0]]), np.array([0]))
+    array([[0, 2, 1]])
+    """
+    # A row need not come first among its neighbours, as others may lie at its place.
+    alike = Neighbourhood(places, np.zeros(len(places), np.int8))
+    return np.c_[row, alike.nearest(places[row], row)]
+
+
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     """Return distances (B,) [m] from queries (B, D) float64 to a tree's nearest place, with autograd."""
     distance, row = tree.query(numbers(queries))

@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 from scipy.linalg import eigh
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
@@ -26,7 +25,7 @@ from gsparc.models.target_rows import entry_variance, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
@@ -275,10 +274,7 @@ def kernel_given_nearest(
         seed: of rows that are drawn.
     """
     row = covering(places, LOOKED_AT, seed)
-    near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
-    # A row need not come first among its neighbours, as others may lie at its place.
-    own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
-    rows = np.c_[row, np.take_along_axis(near, own, 1)]
+    rows = with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
