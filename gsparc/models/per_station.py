@@ -27,8 +27,9 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
+from gsparc.models.closed_form import stored
 from gsparc.models.fitting import common_label
-from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions, import_path
+from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext, FitReport
@@ -293,10 +294,7 @@ class PerStation(Method):
 
     def state(self) -> dict[str, Any]:
         """Return the class and state of every copy, by its station's number."""
-        copies = {
-            str(number): {"target": import_path(copy.stored_as), "state": copy.state()}
-            for number, copy in self._copies.items()
-        }
+        copies = {str(number): stored(copy) for number, copy in self._copies.items()}
         return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:

@@ -187,13 +187,9 @@ class Nearest(Posterior):
 
 
 def given(
-    prior: Prior,
-    values: Values,
-    seed: int,
-    more: Values | None = None,
-    extra: Tensor | None = None,
+    prior: Prior, values: Values, seed: int, more: Values | None = None, extra: Tensor | None = None,
     most: int = NEIGHBOURS,
-) -> Nearest:
+) -> Nearest:  # fmt: skip
     """Return the process given places, with settings as they are.
 
     >>> line = np.linspace(0.0, 9.0, 10)[:, None]

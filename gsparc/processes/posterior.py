@@ -50,13 +50,9 @@ class Exact(Posterior):
 
     @classmethod
     def of(
-        cls,
-        prior: Prior,
-        places: Tensor,
-        values: Tensor,
-        extra: Tensor | None = None,
+        cls, prior: Prior, places: Tensor, values: Tensor, extra: Tensor | None = None,
         factor: Factor | None = None,
-    ) -> Exact:
+    ) -> Exact:  # fmt: skip
         """Condition on values (n, P) at places (n, D) float64 [m]; with their factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor

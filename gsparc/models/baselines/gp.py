@@ -130,8 +130,6 @@ class GaussianProcess(Differentiable, ClosedForm):
         self.limit, self.about = components, mean
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        if self.kind == "rssi":
-            return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
         self.powers = None
@@ -166,11 +164,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
-    def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
-    ) -> tuple[str, ...]:
+    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
         assert self.site is not None
-        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), side)
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 

@@ -267,12 +267,9 @@ class ChannelField(ClosedForm):
         """See `Method.state`; factors are computed again by `restore`."""
         groups = [each.group for each in self._conditioned()]
         return {
-            "prior": self.prior.state(),
-            "channel": list(self.channel),
-            "rows": torch.from_numpy(self.rows),
-            "runs": stored(self.runs),
-            "groups": [group.state(self.runs.factors) for group in groups],
-        }
+            "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
+            "runs": stored(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
+        }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

@@ -90,15 +90,10 @@ class MovingArrayField(Differentiable, ClosedForm):
     takes_budget = True
 
     def __init__(
-        self,
-        search: SearchSettings = SearchSettings(),
-        trend: TrendSettings = TrendSettings(),
-        searches: int = 1,
-        rest_rows: int = 1500,
-        components: int = 512,
-        seed: int = 0,
+        self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
+        searches: int = 1, rest_rows: int = 1500, components: int = 512, seed: int = 0,
         name: str = "moving_array",
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         if searches < 1 or rest_rows < 3:
             raise ValueError(

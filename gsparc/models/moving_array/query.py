@@ -86,13 +86,9 @@ class Images:
     """
 
     def __init__(
-        self,
-        array: Array,
-        basis: Separable,
-        trends: Sequence[PowerTrend],
-        residual: Residual,
+        self, array: Array, basis: Separable, trends: Sequence[PowerTrend], residual: Residual,
         places: Tensor,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
         # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)

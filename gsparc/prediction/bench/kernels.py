@@ -27,11 +27,9 @@ def moving(scene: Scene, batch: int) -> Case:
 
     return Case(
         *("forward, moving receiver", scene.projection, len(scene), batch),
-        work=_blending(scene, poses, batch * COMPLEX),
-        kernel=draw,
-        whole=lambda: scene.model(tx, poses),
+        work=_blending(scene, poses, batch * COMPLEX), kernel=draw, whole=lambda: scene.model(tx, poses),
         **_reference(scene, batch, lambda: draw("reference")),
-    )
+    )  # fmt: skip
 
 
 def plan(scene: Scene, batch: int) -> Case:
