@@ -70,7 +70,7 @@ SMALL: dict[str, dict[str, Any]] = {
     **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
 }
 UPLINK: dict[str, dict[str, Any]] = {
-    "ridge": {}, "fire": {"steps": 3},
+    "ridge": {}, "fire": {"max_steps": 3},
     "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
 }  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
@@ -157,7 +157,7 @@ def test_a_method_is_what_the_table_says(name, tmp_path):
     method = method_class(name)().made_for(data_of(name, tmp_path))
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in (*PEERS, "image_source_gp", "splat", "gsparc", *NAMED))
+    assert method.resumable == (name in (*PEERS, "fire", "image_source_gp", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
