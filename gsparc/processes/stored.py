@@ -11,7 +11,13 @@ import numpy as np
 import torch
 
 PLUGINS = "gsparc.terms"  # entry points of installed kinds
-_KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
+KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
+
+
+def name_of(kind: type) -> str:
+    """Return the name that a class is stored by: with its module where that is not ours."""
+    ours = kind.__module__.startswith("gsparc.")
+    return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
 
 
 class Stored:
@@ -22,7 +28,7 @@ class Stored:
 
     def __init_subclass__(cls, **rest: Any) -> None:
         super().__init_subclass__(**rest)
-        _KINDS[cls.__name__] = cls
+        KINDS[name_of(cls)] = cls
 
     def state(self) -> dict[str, Any]:
         """Return what `read` needs: the fields of a dataclass, else all attributes."""
@@ -42,7 +48,7 @@ def stored(part: Any) -> Any:
     [1.0, None, {'array': tensor([0., 0.], dtype=torch.float64)}]
     """
     if isinstance(part, Stored):
-        return {"kind": type(part).__name__, "state": part.state()}
+        return {"kind": name_of(type(part)), "state": part.state()}
     if isinstance(part, np.ndarray):
         return {"array": torch.from_numpy(part)}
     return [stored(each) for each in part] if isinstance(part, (tuple, list)) else part
@@ -61,10 +67,10 @@ def restored(part: Any) -> Any:
     if "array" in part:
         return part["array"].numpy()
     name = str(part["kind"])
-    if name not in _KINDS:
+    if name not in KINDS:
         for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
-            if point.attr == name:
+            if f"{point.module}.{point.attr}" == name:
                 point.load()
-    if name not in _KINDS:
+    if name not in KINDS:
         raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
-    return _KINDS[name].read(part["state"])
+    return KINDS[name].read(part["state"])
