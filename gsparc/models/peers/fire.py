@@ -78,7 +78,7 @@ class Fire(UplinkMethod, TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0115}
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0125}
     makes = Coder
     name: str = "fire"
     hidden: int = 256
