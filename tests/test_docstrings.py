@@ -18,7 +18,7 @@ POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + R
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"gsparc": "gsparc", "ops": "gsparc.ops", "callbacks": "gsparc.callbacks"}  # by folder
 # They ask for Sionna's solver, or for a cloud of a trained field.
-ELSEWHERE = ("gsparc.apps.export.along.link", "gsparc.apps.view.ply")
+ELSEWHERE = ("gsparc.apps.view.ply",)
 LEAST = 150
 
 

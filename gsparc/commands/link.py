@@ -51,7 +51,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     errors, surest = {}, {}
     rates, own = study.rates()
     facts |= own | {"time/mcs_s": time.perf_counter() - started}
-    draw_rates(rates["expected"], study.score, title, run_dir / "mcs.png")
+    draw_rates(rates, study.score, title, run_dir / "mcs.png")
     write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
     for modulation, ebno_db in points.items():
         log.info("PUSCH, %s", modulation)

@@ -7,15 +7,16 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.apps.locate.baselines.table import BASELINES
-from gsparc.apps.locate.judging import by_fingerprints, by_model, report
+from gsparc.apps.locate.fingerprints import by_fingerprints
+from gsparc.apps.locate.judging import by_model, report
+from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 
 LIMITS = {
-    "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)), "track": switch(),
+    "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),
     "calibrate": whole(0), "calibrate_s": POSITIVE, "rows": or_null(whole(1)), "phase_known": switch(),
 }  # fmt: skip
 
@@ -30,7 +31,7 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     RunSettings.of(config)
     check_arguments(config, **LIMITS)
     for name in config.against:
-        choice(*BASELINES).check("against", name)
+        choice(*PLAIN).check("against", name)
     if config.dataset.name == "fingerprints":
         localisation = by_fingerprints(config)
     else:

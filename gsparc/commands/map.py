@@ -9,7 +9,6 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.apps.maps.making import map_of
-from gsparc.apps.maps.page import write_page
 from gsparc.apps.maps.pictures import draw_layer, file_name, layers
 from gsparc.apps.maps.promise import PromiseSettings
 from gsparc.apps.maps.promised import notes_of, promise_of
@@ -55,23 +54,18 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
     # Refused before evidence is gathered, which takes minutes.
-    origin = predictor.site.georeference
-    geotiff_wanted(config.geotiff, origin)
-    if config.degrees and origin is None:
-        raise DataError("degrees=true: positions were in metres about an unknown origin, not in degrees")
+    geotiff_wanted(config.geotiff)
     promise = promise_of(str(config.ckpt), settings)
     field = map_of(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
     lines = notes_of(field, coverage)
-    sheets = list(layers(field))
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in sheets if config.pictures else ():
-        draw_layer(field, layer, run_dir / file_name(layer), title, floor, origin if config.degrees else None)
-    if origin is not None and geotiff_wanted(config.geotiff, origin):
-        write_geotiff(run_dir / "map.tif", field, origin)
-    write_page(run_dir / "map.html", field, sheets, title, lines, floor)
+    for layer in layers(field) if config.pictures else ():
+        draw_layer(field, layer, run_dir / file_name(layer), title, floor)
+    if geotiff_wanted(config.geotiff):
+        write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
     facts = {
         **field.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,

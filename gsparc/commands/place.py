@@ -7,14 +7,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.pictures import draw_placing
-from gsparc.apps.maps.placing import (
-    NewStation,
-    in_words,
-    new_station_error,
-    number,
-    place_next,
-    unheard_stations_error,
-)
+from gsparc.apps.maps.placing import NewStation, new_station_error, place_next, unheard_stations_error
 from gsparc.apps.maps.promised import promise_of, trained
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
@@ -33,7 +26,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         raise unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
     query = {
-        "area": settings["area"], "goal": config.goal, "threshold_db": float(config.threshold_db),
+        "area": settings["area"], "threshold_db": float(config.threshold_db),
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
     }  # fmt: skip
     place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
@@ -43,7 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         error = new_station_error(trained(path, settings["dataset"]), int(config.left_out))
     placing = place_next(predictor, count=config.count, promise=promise, error=error, **query)
     columns = coordinates(placing.places, predictor)
-    columns |= {placing.what: placing.goal, "low": placing.low, "high": placing.high}
+    columns |= {"coverage": placing.coverage, "low": placing.low, "high": placing.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
     draw_placing(placing, run_dir / "place.png", level, unit)
@@ -54,16 +47,15 @@ def task(config: DictConfig) -> dict[str, Any]:
         latitude, longitude, _ = predictor.degrees(placing.places[0])
         where = f"{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
     facts = {
-        "place/x": x, "place/y": y, "place/z": z, "place/goal": placing.what, "place/before": placing.before,
-        "place/after": placing.goal[0], "place/low": placing.low[0], "place/high": placing.high[0],
+        "place/x": x, "place/y": y, "place/z": z, "place/before": placing.before,
+        "place/after": placing.coverage[0], "place/low": placing.low[0], "place/high": placing.high[0],
         "place/candidates": len(placing.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
-    low, high = (number(placing.what, ends[0], unit) for ends in (placing.low, placing.high))
     lines = [
-        f"now {in_words(placing.what, placing.before, level, unit)}",
-        f"with a station at {where}: "
-        f"{in_words(placing.what, placing.goal[0], level, unit)} (90 % interval {low} to {high})",
+        f"now {placing.before:.1%} of the area with {level:g} {unit} or more",
+        f"with a station at {where}: {placing.coverage[0]:.1%} "
+        f"(90 % interval {placing.low[0]:.1%} to {placing.high[0]:.1%})",
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")

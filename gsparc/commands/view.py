@@ -9,26 +9,22 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.apps.maps.making import place_of
-from gsparc.apps.maps.pictures import layers
-from gsparc.apps.view.building import Building, cloud_colours, cloud_of
+from gsparc.apps.view.building import cloud_colours, cloud_of
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, grid_for
-from gsparc.apps.view.still import draw_still
 from gsparc.apps.view.viewed import open_viewed
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import whole
-from gsparc.data.walls import read_walls
 from gsparc.prediction.timing import peak_memory
 
 log = logging.getLogger(__name__)
 
-SAVED = (".html", ".png", ".ply")
+SAVED = (".html", ".ply")
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -52,28 +48,24 @@ def check(save: Path | None, port: int) -> None:
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
     whole(0, 65535).check("port", port)
-    # Pages are made of viser's client; pictures and splat files are not.
+    # Pages are made of viser's client; splat files are not.
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
-        without = "(save=picture.png and save=gaussians.ply do without)"
-        raise DataError(f"viewing in a browser needs viser: pip install 'gsparc[viewer]' {without}")
+        raise DataError(
+            "viewing in a browser needs viser: pip install 'gsparc[viewer]' (save=gaussians.ply does without)"
+        )
 
 
 def view_of(settings: dict[str, Any]) -> SiteView:
     """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
-    plan, walls = plan_of(settings), settings["walls"]
-    building = Building(plan, None if walls is None else read_walls(walls))
+    plan = plan_of(settings)
     viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
-    map_layers: tuple[Any, ...] = ()
-    if settings["map"] is not None:
-        field = FieldMap.read(settings["map"])
-        map_layers = tuple((field.grid, layer) for layer in layers(field) if not layer.words)
     at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, building, grid_for(viewed, settings, plan), map_layers, at, other)
+    return SiteView(viewed, plan, grid_for(viewed, settings, plan), at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:
     """Serve until Ctrl-C; return what is said then."""
-    # Imported here, as viser is an extra that pictures do without.
+    # Imported here, as viser is an extra that splat files do without.
     from gsparc.apps.view.server.serve import Server
 
     server = Server(view, host, port)
@@ -83,11 +75,8 @@ def serve(view: SiteView, host: str, port: int) -> str:
 
 
 def write(view: SiteView, path: Path) -> str:
-    """Write a page, a picture or a splat file, whole or not at all; return what is said then."""
-    ending = path.suffix.lower()
-    if ending == ".png":
-        draw_still(view, path)
-    elif ending == ".html":
+    """Write a page or a splat file, whole or not at all; return what is said then."""
+    if path.suffix.lower() == ".html":
         from gsparc.apps.view.server.page import page
 
         with whole_file(path) as partial:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,6 @@ from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
-
-from gsparc.data.links.georeference import Georeference
 
 MOST_POINTS = 1500  # measured places that are drawn
 # A city's mesh has millions of triangles; the short ones are not seen at this scale.
@@ -30,25 +27,6 @@ def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     # UTM northings, 5e6 m, would be shown as small numbers beside an offset at the axis' end.
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
-
-
-def in_degrees(axis: Any, origin: Georeference) -> None:
-    """Write longitudes and latitudes at the ticks of an axis in metres about `origin`."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
-    middle = np.array([[(left + right) / 2, (low + high) / 2]])
-
-    def written(number: int) -> Callable[[float, int], str]:
-        def at(value: float, _: int) -> str:
-            place = middle.copy()
-            place[0, number] = value
-            return f"{float(origin.to_degrees(place)[1 - number][0]):.4f}"
-
-        return at
-
-    axis.xaxis.set_major_formatter(written(0))
-    axis.yaxis.set_major_formatter(written(1))
-    axis.tick_params(axis="x", labelrotation=30)
-    axis.set(xlabel="longitude [deg]", ylabel="latitude [deg]")
 
 
 def framed(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:

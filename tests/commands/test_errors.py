@@ -40,14 +40,14 @@ REFUSED = [
     (f"{LOCATE} offset_db=-1", "offset_db=-1: a number of at least 0"),
     (f"{LOCATE} calibrate=-1", "calibrate=-1: a whole number of at least 0"),
     (f"{LOCATE} rows=0", "rows=0: a whole number of at least 1"),
-    (f"{LOCATE} track=perhaps", "track='perhaps': one of true, false"),
-    (f"{LOCATE} against=[wknn]", "against='wknn': one of nearest, knn, weighted_knn"),
+    (f"{LOCATE} phase_known=perhaps", "phase_known='perhaps': one of true, false"),
+    (f"{LOCATE} against=[wknn]", "against='wknn': one of nearest, weighted_knn"),
     (f"{LOCATE} data=none.npz", "none.npz: no such file"),
     (f"{LOCATE} data={{prints}}/walks.npz", "walks.npz"),
     (PRINTS, "give dataset.file=FILE, and no ckpt"),
     (f"{HALL} ckpt={{spectra}}", "give dataset.file=FILE, and no ckpt"),
     (f"{PRINTS} dataset.file=none.npz", "none.npz: no such file"),
-    (f"{PRINTS} dataset.file={{prints}}/timeless.npz track=true", "does not say when its rows were heard"),
+    (f"{HALL} offset_db=3", "of trained models alone"),
     (f"{HALL} data={{prints}}/others.npz", "no access point of"),
     (f"{HALL} dataset.held_out=2", "dataset.held_out=2: a number above 0 and below 1"),
     (f"{HALL} dataset.side_m=-1 dataset.split=blocks", "dataset.side_m=-1: a number above 0"),
@@ -60,12 +60,10 @@ def prints(fingerprints, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("prints")
     changes = {
         "walks": {},
-        "timeless": {"time_s": None},
         "others": {"access_point": np.array([f"x{name}" for name in fingerprints["access_point"]])},
     }  # fmt: skip
     for name, change in changes.items():
-        parts = {key: part for key, part in {**fingerprints, **change}.items() if part is not None}
-        np.savez(folder / f"{name}.npz", **parts)
+        np.savez(folder / f"{name}.npz", **(fingerprints | change))
     return folder
 
 

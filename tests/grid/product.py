@@ -63,12 +63,12 @@ def evaluated(world: World, folder: Path, objects: Objects) -> None:
 
 
 def drawn(world: World, folder: Path, objects: Objects) -> None:
-    """A map of powers without promise, a picture of the rest."""
+    """A map of powers without promise, a page of the rest."""
     ckpt = f"ckpt='{folder / 'run' / 'model.ckpt'}'"
     if world.kind == "power" and world.moving != "both":
         said, entry = ["promised=false", "step_m=0.5", "pictures=false"], COMMANDS["map"].run
     else:
-        said, entry = [f"save='{folder / 'view.png'}'", "step_m=0.5"], COMMANDS["view"].run
+        said, entry = [f"save='{folder / 'view.html'}'", "step_m=0.5"], COMMANDS["view"].run
     answer = knock(entry, "gsparc", [ckpt, *said, f"hydra.run.dir='{folder / 'drawn'}'"])
     assert answer.status == 0, answer.err[-1:]
 

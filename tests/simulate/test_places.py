@@ -41,6 +41,11 @@ def test_sectors_are_stations_at_equal_angles():
     np.testing.assert_allclose(found[4].position, [0, 111.03, 8.5], atol=0.02)
 
 
+def test_a_third_coordinate_beside_degrees_was_ignored():
+    (found,) = stations([{"position_deg": [40.001, -30.0, 12.0], "height_m": 3}], None, SOMEWHERE)
+    np.testing.assert_allclose(found.position, [0, 111.03, 12.0], atol=0.02)
+
+
 @pytest.mark.parametrize("entry, words", [
     ({"postion_m": [0, 0, 1]}, "no such setting"),
     ({}, "give position_m"),

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-Rule = Literal["target", "expected"]
 # 14 symbols of a slot less two of pilots.
 SYMBOLS = 12  # of a slot that carry data
 # 256 positions x 28 MCS x tones are held by Sionna at once.
@@ -31,9 +29,9 @@ class Rates:
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
         best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
         fails: (n,) block error rate of the chosen MCS.
-        regret_bps: (n,) throughput that the choice is expected to miss; NaN where the rule knows no doubt.
+        regret_bps: (n,) throughput that the choice is expected to miss.
         outage: (n,) bool, the oracle's transport blocks mostly fail.
-        care: what the choice allowed for: a backoff [dB], or a share of `SLOW_DECIBEL`.
+        care: share of `SLOW_DECIBEL` that the choice allowed for.
     """
 
     snr_db: float
@@ -77,9 +75,9 @@ class Band:
 class Adaptation:
     """MCS by effective SINR (EESM) and Sionna's block error tables, PUSCH, MCS table 1.
 
-    The oracle takes the highest MCS whose blocks fail in at most `bler_target`. From a prediction, rule
-    `target` does the same after a backoff; rule `expected` takes the MCS that is expected to carry most,
-    the effective SINR being normal in dB with a spread that grows with the expected error.
+    The oracle takes the highest MCS whose blocks fail in at most `bler_target`. From a prediction the MCS is
+    taken that is expected to carry most, the effective SINR being normal in dB with a spread that grows with
+    the expected error.
 
     Args:
         bler_target: of a transport block.
@@ -101,20 +99,16 @@ class Adaptation:
         efficiency = (order.double() * rate.double()).cpu()
         self.full_bps = efficiency * subcarriers * symbols_per_s
 
-    def rates(self, band: Band, noise: float, care: float = 0.0, rule: Rule = "target") -> Rates:
+    def rates(self, band: Band, noise: float, care: float) -> Rates:
         """Choose on the prediction, live with the truth; `noise` is the noise power, `care` as in `Rates`."""
         there = self._effective_db(band.true.abs().square() / noise)
         guess = self._effective_db(band.expected_power / noise)
         fails = self._fails(there)
         oracle = self._highest(fails)
-        if rule == "target":
-            chosen = self._highest(self._fails(guess - care))
-            regret = torch.full((len(chosen),), torch.nan, dtype=torch.float64)
-        else:
-            # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
-            loud = band.expected_power.mean(1).clamp_min(1e-30)
-            doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
-            chosen, regret = self._carries_most(guess, care * doubt)
+        # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
+        loud = band.expected_power.mean(1).clamp_min(1e-30)
+        doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
+        chosen, regret = self._carries_most(guess, care * doubt)
         # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 

@@ -9,15 +9,13 @@ import numpy as np
 import pandas as pd
 
 from gsparc.apps.link.adaptation import Rates
-from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
+from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.prediction.risk import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),
-    "ls@accepted": ("LS pilots, accepted", GREY, "-"),
     "lmmse@accepted": ("LMMSE pilots, accepted", PALETTE[2], "-"),
     "predicted@accepted": ("predicted, accepted", PALETTE[0], "-"),
-    "predicted_variance@accepted": ("predicted with its variance, accepted", PALETTE[3], "-"),
     "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", PALETTE[6], "-"),
     "perfect": ("perfect, all", "black", ":"),
     "lmmse": ("LMMSE pilots, all", PALETTE[2], ":"),
@@ -25,7 +23,7 @@ STYLES = {
     "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
     "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
 }
-SHORT = ("perfect", "lmmse", "predicted", "predicted_variance", "predicted_pilots")  # by acceptance
+SHORT = ("perfect", "lmmse", "predicted", "predicted_pilots")  # by acceptance
 RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),

@@ -1,8 +1,8 @@
-"""5G NR PUSCH with six kinds of channel knowledge, every block the same for all of them."""
+"""5G NR PUSCH with four kinds of channel knowledge, every block the same for all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -13,7 +13,6 @@ from gsparc.apps.link.adaptation import Band
 
 Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-RECEIVERS = ("perfect", "ls", "lmmse", "predicted", "predicted_variance", "predicted_pilots")
 LEAST_VARIANCE = 1e-6  # of a channel's power: pilots always correct a little
 MODULATIONS = {"qpsk": 5, "qam16": 14}  # MCS of table 1: rates 0.37 and 0.54
 
@@ -28,18 +27,13 @@ class Pusch:
         correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,) complex, from
             training channels; the LMMSE estimator's knowledge.
         iterations: of the LDPC decoder.
-        receivers: some of `RECEIVERS`.
+        with_pilots: whether the prediction is also corrected by pilots, for which it needs a variance.
     """
 
     def __init__(
-        self,
-        modulation: str,
-        blocks: int,
-        spacing_khz: int,
-        correlation: np.ndarray,
-        iterations: int = 20,
-        receivers: Sequence[str] = RECEIVERS,
-    ) -> None:
+        self, modulation: str, blocks: int, spacing_khz: int, correlation: np.ndarray, iterations: int = 20,
+        with_pilots: bool = True,
+    ) -> None:  # fmt: skip
         from sionna.phy import nr
 
         config = nr.PUSCHConfig()
@@ -54,30 +48,23 @@ class Pusch:
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
-        # What the receiver assumes of pilots must be what the transmitter sends.
-        dmrs = config.dmrs
-        shape = dmrs.length, dmrs.additional_position, dmrs.num_cdm_groups_without_data
         estimators: dict[str, Estimator] = {
-            "ls": nr.PUSCHLSChannelEstimator(self.grid, *shape, interpolation_type="lin"),
-            "lmmse": _Wiener(self.grid, correlation),
-            "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
-            **{name: self._known_channel(name) for name in ("perfect", "predicted", "predicted_variance")},
-        }
+            "perfect": lambda y, no: self._known["perfect"], "lmmse": _Wiener(self.grid, correlation),
+            "predicted": lambda y, no: self._known["predicted"],
+        }  # fmt: skip
+        if with_pilots:
+            estimators["predicted_pilots"] = _Wiener(self.grid, correlation, lambda: self._prior)
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
         self.receivers = {
-            name: nr.PUSCHReceiver(self.transmitter, channel_estimator=estimators[name], **how)
-            for name in receivers
+            name: nr.PUSCHReceiver(self.transmitter, channel_estimator=estimator, **how)
+            for name, estimator in estimators.items()
         }
 
     @property
     def pilot_share(self) -> float:
         """Share of a slot's resource elements that pilots occupy."""
         return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
-
-    def _known_channel(self, name: str) -> Estimator:
-        """An estimator that knows the channel beforehand."""
-        return lambda y, no: self._known[name]
 
     def run(self, band: Band, ebno_db: float, position: np.ndarray, batch: int) -> pd.DataFrame:
         """Send a block over each of `position` (n,), indices into the band.
@@ -98,11 +85,8 @@ class Pusch:
             scale = band.true[at].abs().square().mean(1).sqrt()[:, None]
             self._prior = band.predicted[at] / scale, band.variance[at] / scale[:, 0] ** 2
             there, guess = (self._slots(h[at] / scale) for h in (band.true, band.predicted))
-            # Variance 0 for those that are taken for exact: their receiver trusts the estimate fully.
-            exact, doubt = torch.zeros(1), self._prior[1].view(-1, *[1] * 6).expand(there.shape).contiguous()
-            self._known = {
-                "perfect": (there, exact), "predicted": (guess, exact), "predicted_variance": (guess, doubt)
-            }  # fmt: skip
+            # Variance 0: what is taken for exact is trusted fully.
+            self._known = {"perfect": (there, torch.zeros(1)), "predicted": (guess, torch.zeros(1))}
             sent, bits = self.transmitter(len(at))
             received = apply(sent, there, no)
             for name, receiver in self.receivers.items():

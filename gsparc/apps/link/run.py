@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.apps.link.adaptation import Rates, Rule
+from gsparc.apps.link.adaptation import Rates
 from gsparc.apps.link.channels import channels, on_band
-from gsparc.apps.link.pusch import RECEIVERS, Pusch, frequency_correlation
+from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.apps.link.study import (
     acceptance,
     adapt,
@@ -20,7 +20,6 @@ from gsparc.apps.link.study import (
     curves,
     pusch_facts,
     rate_facts,
-    tradeoff,
     transmit,
 )
 from gsparc.evaluation.open_runs import Opened
@@ -29,7 +28,6 @@ from gsparc.prediction.risk import Guarantee, accept
 
 log = logging.getLogger(__name__)
 
-NEED_VARIANCE = ("predicted_variance", "predicted_pilots")
 SHARES = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
@@ -43,8 +41,7 @@ class LinkStudy:
         settings: see conf/link.yaml.
 
     Raises:
-        ValueError: no channels with their frequencies, no such antenna, or receivers that are needed are not
-            asked for.
+        ValueError: no channels with their frequencies, or no such antenna.
     """
 
     def __init__(self, run: Opened, settings: Mapping[str, Any]) -> None:
@@ -55,24 +52,15 @@ class LinkStudy:
         site.need_phase("gsparc link")
         if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
             raise ValueError(f"antenna={self.antenna}: the target has {antennas}")
-        self.receivers = list(self.shape["receivers"])
-        if {"perfect", "lmmse", "predicted"} - set(self.receivers) or set(self.receivers) - set(RECEIVERS):
-            raise ValueError(
-                f"pusch.receivers={self.receivers}: expected perfect, lmmse and predicted at least"
-            )
         self.tones, self.mcs = site.subcarriers_hz, settings["mcs"]
-        self.count, self.spacing_hz = (
-            SUBCARRIERS_PER_BLOCK * self.shape["blocks"],
-            1e3 * self.shape["spacing_khz"],
-        )
+        self.count = SUBCARRIERS_PER_BLOCK * self.shape["blocks"]
+        self.spacing_hz = 1e3 * self.shape["spacing_khz"]
         self.one = slice(self.antenna, self.antenna + 1)
         # The PUSCH grid around the measured band's middle, whatever tones were measured.
         frequency_hz = centred(float(self.tones.mean()), self.spacing_hz, self.count)
         grid = channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
-        evidence, promise = (
-            on_band(grid, self.data, self.fold, self.fold.test),
-            Guarantee(**settings["promise"]),
-        )
+        evidence = on_band(grid, self.data, self.fold, self.fold.test)
+        promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
         kind, threshold, self.test, aside = accept(evidence, promise, *how)
         scores = evidence.scores[kind]
@@ -82,6 +70,9 @@ class LinkStudy:
         rows = aside[scores[aside] >= threshold.value]
         self.aside = rows if len(rows) else aside
         self.states_variance = bool(grid.variance.isfinite().all())
+        if not self.states_variance:
+            text = "%s states no error variance: rates are chosen as if it were exact, pilots do not mend it"
+            log.warning(text, self.method.name)
         self.grid, bad = grid.of(self.test), promise.bad(evidence.error[self.test])
         self.facts: dict[str, Any] = {
             "seed": int(settings["seed"]), "positions": len(self.test), "confidence/kind": kind,
@@ -101,16 +92,13 @@ class LinkStudy:
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
         return beam_facts(every.true, every.predicted, accepted)
 
-    def rates(self) -> tuple[dict[Rule, list[Rates]], dict[str, Any]]:
+    def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Rate adaptation at every noise level and its facts."""
-        if not self.states_variance:
-            text = "%s states no error variance: rates are adapted as if predictions were exact"
-            log.warning(text, self.method.name)
         own, other = (
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = adapt(own, other, self.mcs["snr_db"], self.mcs)
+        rates = adapt(own, other, self.mcs)
         return rates, rate_facts(rates, self.accepted)
 
     def send(
@@ -118,15 +106,11 @@ class LinkStudy:
     ) -> tuple[dict[str, pd.DataFrame], tuple[float, pd.DataFrame], dict[str, Any]]:
         """`curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]."""
         begun = time.perf_counter()
-        receivers = [r for r in self.receivers if self.states_variance or r not in NEED_VARIANCE]
-        if len(receivers) < len(self.receivers):
-            missing = ", ".join(r for r in self.receivers if r not in receivers)
-            log.warning("%s states no error variance: left out are %s", self.method.name, missing)
         # Only training rows: the estimator's correlation must not know test channels.
         heard = self.data.targets(self.fold.train)[:, self.antenna]
         known = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
-        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
+        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.states_variance
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = transmit(pusch, self.grid.band(), levels, sizes)
@@ -135,8 +119,6 @@ class LinkStudy:
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
             facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
-        trade = tradeoff(blocks, self.score, SHARES)
-        facts |= {f"tradeoff/{modulation}/{name}": value for name, value in trade.items()}
         facts |= {
             "pusch/truth": self.grid.source, "pilots/share_of_slot": pusch.pilot_share,
             # An accepted position needs no pilots at all.

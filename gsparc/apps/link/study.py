@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gsparc.apps.link.adaptation import Adaptation, Band, Rates, Rule
+from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
 from gsparc.data.executor import each
 from gsparc.prediction.risk import binomial_interval
@@ -82,15 +82,13 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
     return facts
 
 
-def adapt(
-    band: Band, aside: Band, snr_db: list[float], settings: Mapping[str, Any]
-) -> dict[Rule, list[Rates]]:
-    """Rates of both rules at noise levels that put the median position at `snr_db`.
+def adapt(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
+    """Rates at noise levels that put the median position at `snr_db` of the settings.
 
     Args:
         band: of the positions to be judged.
-        aside: of others, on which care and backoff are chosen.
-        snr_db, settings: see conf/link.yaml.
+        aside: of others, on which the care is chosen.
+        settings: `mcs` of conf/link.yaml.
 
     Raises:
         ValueError: every position is silent.
@@ -102,36 +100,24 @@ def adapt(
     median = band.median_power
     if median <= 0:
         raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
-    noises = [median / 10 ** (level / 10) for level in snr_db]
+    noises = [median / 10 ** (level / 10) for level in settings["snr_db"]]
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
-    delivered = {
-        c: sum(loop.rates(aside, n, c, "expected").chosen_bps.mean() for n in noises)
-        for c in settings["care"]
-    }
+    delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in settings["care"]}
     care = max(delivered, key=lambda c: delivered[c])
-
-    def at(noise: float) -> tuple[Rates, Rates]:
-        # A backoff for each noise level is tuned aside, as its best depends on the slope of the tables.
-        backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
-        target = loop.rates(band, noise, max(backed, key=lambda b: backed[b]))
-        return loop.rates(band, noise, care, "expected"), target
-
-    expected, target = zip(*(rates for _, rates in each(at, noises, "noise levels")), strict=True)
-    return {"expected": list(expected), "target": list(target)}
+    return [rates for _, rates in each(lambda noise: loop.rates(band, noise, care), noises, "noise levels")]
 
 
-def rate_facts(rates: Mapping[Rule, list[Rates]], accepted: np.ndarray) -> dict[str, Any]:
-    """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
+def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
+    """`mcs/<snr>dB/*`: throughput against the oracle.
 
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
     most; of all positions, of accepted ones, and of all where the others send pilots.
     """
-    facts: dict[str, Any] = {}
-    for rule, ones in rates.items():
-        for one in ones:
-            stem = f"mcs/{one.snr_db:g}dB" + ("" if rule == "expected" else f"/{rule}")
-            facts |= {f"{stem}/{name}": value for name, value in _rates_of(one, accepted).items()}
-    return facts
+    return {
+        f"mcs/{one.snr_db:g}dB/{name}": value
+        for one in rates
+        for name, value in _rates_of(one, accepted).items()
+    }
 
 
 def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
@@ -150,7 +136,7 @@ def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
             "tbler": float(one.fails[some].mean()), "off_by_more_than_2": float((miss > 2).mean()),
         } if some.any() else {}  # fmt: skip
         facts |= {key + name: value for key, value in own.items()}
-    return facts | (_by_regret(one) if np.isfinite(one.regret_bps).all() else {})
+    return facts | _by_regret(one)
 
 
 def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:
@@ -245,16 +231,6 @@ def acceptance(
     there = blocks[blocks.ebno_db == level]
     rates = {share: _surest(there, score, share).groupby("receiver").failed.mean() for share in shares}
     return level, pd.DataFrame(rates).T
-
-
-def tradeoff(blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]) -> dict[str, Any]:
-    """`<share>/behind_db`: dB behind perfect knowledge at 10 % failed blocks, on the surest shares."""
-    facts: dict[str, Any] = {}
-    for share in shares:
-        some = _surest(blocks, score, share).pivot_table("failed", "ebno_db", "receiver", sort=False)
-        own, perfect = (crossing(some[name]) for name in ("predicted", "perfect"))
-        facts[f"{share:.0%}/behind_db"] = None if own is None or perfect is None else own - perfect
-    return facts
 
 
 def _surest(blocks: pd.DataFrame, score: np.ndarray, share: float) -> pd.DataFrame:

@@ -17,9 +17,7 @@ SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 160
 
 
-def calibrated(
-    snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust, blurred: bool = True
-) -> Trust:
+def calibrated(snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust) -> Trust:
     """Return the trust under which held-out places are most likely, with an area that holds a share.
 
     All numbers but the level maximise the mean log density at the true places, a proper score; the level is
@@ -32,16 +30,14 @@ def calibrated(
         places: (n, 3), where they were heard [m, local].
         share: of places, to be held.
         start: of the search.
-        blurred: whether errors of recorded places are learned too; without, cells stay as they are.
     """
     edge = float(np.max([one.cells.edge.max() for one in snapshots]))
-    count = 4 if blurred else 3
-    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS][:count]).T
+    spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
     # In logarithms: all are positive and known up to factors.
     def of(point: np.ndarray) -> Trust:
-        inflation, temperature, tail, *spread = np.exp(np.clip(point, *spans)).tolist()
-        return Trust(inflation, temperature, tail, *(edge * one for one in spread))
+        inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
+        return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
         trust = of(point)
@@ -49,9 +45,9 @@ def calibrated(
             np.mean([one.by(trust).at(place) for one, place in zip(snapshots, places, strict=True)])
         )
 
-    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD][:count])
+    first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
-    simplex = first + np.vstack([np.zeros(count), np.diag([1.0, -1.5, 1.0, 1.0][:count])])
+    simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
     optimum = minimize(
         surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
     )

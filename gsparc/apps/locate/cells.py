@@ -8,14 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.apps.locate.shared_kernel import STOREY_M
-
 THIN = 0.02  # of the longest side: what is shorter is no axis
 REACH = 3.0  # times the median distance between neighbouring trained places, within which one can stand
-COARSE, MOST_ON_FLOORS = 400, 8_000  # cells of the site's box to begin with, and of all floors at the end
-FINEST_M = 0.4  # no level tells two places nearer than this apart
-MARGIN_M = 2.0  # beyond the outermost trained places of a floor
-APART = np.array([1.0, 1.0, 1e4])  # floors are no neighbours
 
 
 @dataclass(frozen=True)
@@ -96,31 +90,3 @@ def cover(
         if not len(centre):
             raise ValueError("locate: by the plan one can stand nowhere in the box of trained places")
     return Cells(centre, np.broadcast_to(edge, centre.shape).copy())
-
-
-def floors(height: np.ndarray) -> np.ndarray:
-    """Return the median height of the floor that each of heights (n,) [m] is of."""
-    order = np.argsort(height)
-    number = np.empty(len(height), np.int64)
-    number[order] = np.cumsum(np.diff(height[order], prepend=height.min()) > STOREY_M)
-    return np.array([np.median(height[number == one]) for one in range(number.max() + 1)])[number]
-
-
-def cover_floors(places: np.ndarray, around: bool) -> Cells:
-    """Flat cells of the site's box on each floor, halved near trained places (n, 3) [m].
-
-    `around`: cells far from trained places are left out.
-    """
-    flat = np.c_[places[:, :2], floors(places[:, 2])]
-    cells = cover(np.array([flat.min(0) - MARGIN_M, flat.max(0) + MARGIN_M]) * [1, 1, 0], COARSE, False)
-    height = np.repeat(np.unique(flat[:, 2]), len(cells))
-    times = (len(height) // len(cells), 1)
-    cells = Cells(np.c_[np.tile(cells.centre[:, :2], times), height], np.tile(cells.edge, times))
-    tree = cKDTree(np.unique(flat, axis=0) * APART)
-    reach = REACH * float(np.median(tree.query(tree.data, k=[min(2, tree.n)])[0]))
-    while True:
-        near = tree.query(cells.centre * APART)[0] <= np.maximum(reach, np.linalg.norm(cells.edge, axis=1))
-        halved = near & (cells.edge.max(1) >= 2 * FINEST_M)
-        if not halved.any() or len(cells) + 3 * halved.sum() > MOST_ON_FLOORS:
-            return cells.at(near) if around else cells
-        cells = cells.at(~halved).with_others(cells.at(halved).halved())

@@ -1,38 +1,32 @@
-"""Localisation by a trained model or by a field of fingerprints: places, errors, pictures."""
+"""Localisation by a trained model: places, errors beside plain methods, a picture of posteriors."""
 
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.baselines.table import located_by
 from gsparc.apps.locate.cells import Cells, cover
-from gsparc.apps.locate.fingerprints.locator import SHARED, FingerprintLocator, as_snapshots, trusted
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
+from gsparc.apps.locate.neighbours import located_by
 from gsparc.apps.locate.search import Unknown
 from gsparc.apps.locate.snapshots import Snapshots, snapshots
-from gsparc.apps.locate.track import followed
-from gsparc.data.datasets.fingerprints import parted, read_fingerprints
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, SHARE
 from gsparc.data.own import interpreted
 from gsparc.data.raw import read_raw
 from gsparc.evaluation.console import plain
-from gsparc.evaluation.drawing import logarithmic, look, panels, save
+from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
@@ -40,7 +34,6 @@ from gsparc.prediction.predictor import keep
 
 log = logging.getLogger(__name__)
 
-DEVICES_DB = 6.0  # deviation of what receivers of one building add to all levels
 SHOWN = 6  # snapshots, evenly over all
 
 
@@ -49,80 +42,80 @@ class Localisation:
     """Snapshots, and where each was heard.
 
     Attributes:
-        answers: by method; the first is ours.
+        method: name.
+        places: (n, 3) [m, local], by it.
         heard, trained: what was located, and what was learned from.
         origin: (3,) of local coordinates [m].
         placed: whether the places of `heard` are known.
-        level: mass of the areas.
+        about: further columns of `locate.csv`, n values each; `area_m2` where there are areas.
+        inside: (n,) whether true places lie in these areas; None where either is unknown.
+        each_ms: median milliseconds of a snapshot.
         promise: what the areas promise, in words.
         facts: for the summary.
     """
 
-    answers: dict[str, list[Located]]
+    method: str
+    places: np.ndarray
     heard: Snapshots
     trained: Snapshots
     origin: np.ndarray
     placed: bool
-    level: float
+    about: dict[str, list[Any]]
+    inside: np.ndarray | None
+    each_ms: float
     promise: str
     facts: dict[str, Any]
 
-    def columns(self, inside: Sequence[bool]) -> dict[str, Any]:
+    def columns(self) -> dict[str, Any]:
         """Return the columns of `locate.csv`, in the world's coordinates [m]."""
-        located = next(iter(self.answers.values()))
-        place, true = np.array([one.place for one in located]), self.heard.place
+        place, true = self.places, self.heard.place
         columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
         if self.placed:
             columns |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
             columns |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
-        columns |= {"area_m2": [one.area for one in located]}
-        columns |= {"inside": [int(one) for one in inside]} if self.placed else {}
-        return {**columns, "modes": [one.modes for one in located]}
+        return columns | self.about | ({} if self.inside is None else {"inside": (1 * self.inside).tolist()})
 
 
 def report(
     result: Localisation, against: Sequence[str], run_dir: Path
 ) -> tuple[dict[str, Any], list[Table], list[str]]:
-    """Write `locate.csv` and pictures; facts, and where places are known, a table and a sentence of errors.
+    """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
         result: what was located.
         against: names of plain methods beside it.
-        run_dir: where files go.
+        run_dir: where the file goes.
     """
-    (ours, located), heard, facts = next(iter(result.answers.items())), result.heard, dict(result.facts)
-    inside = [one.posterior.level(p) <= result.level for one, p in zip(located, heard.place, strict=True)]
-    write_samples(run_dir / "locate.csv", result.columns(inside))
+    heard, facts = result.heard, dict(result.facts)
+    places, stems = {result.method: result.places}, {result.method: "locate"}
+    write_samples(run_dir / "locate.csv", result.columns())
+    area = result.about.get("area_m2")
     facts |= {
-        "locate/snapshots": len(heard), "locate/track": int(len(result.answers) > 1),
-        "locate/area_m2": float(np.median([one.area for one in located])),
-        "time/locate_ms_p50": float(np.median([one.seconds for one in located]) * 1e3),
+        "locate/snapshots": len(heard), "time/locate_ms_p50": result.each_ms,
+        "locate/area_m2": None if area is None else float(np.median(area)),
     }  # fmt: skip
-    shown_at = [locating.in_world(one, result.origin) for one in located]
-    true = heard.place + result.origin if result.placed else None
-    draw_posteriors(shown_at, true, result.trained.place + result.origin, run_dir / "posteriors.png")
     if not result.placed:
         return facts, [], []
-    places = {name: np.array([one.place for one in answers]) for name, answers in result.answers.items()}
-    stems = {name: "locate" if name == ours else f"locate/{name}" for name in places}
-    for name in against:
-        stems[name] = stem = f"baseline/{name}"
-        beside = located_by(name, result.trained, heard)
-        places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
-    errors = {name: np.linalg.norm(place - heard.place, axis=1) for name, place in places.items()}
-    facts |= {"locate/coverage": float(np.mean(inside))}
-    for name, values in errors.items():
-        median, p90 = np.quantile(values, [0.5, 0.9])
-        facts |= {f"{stems[name]}/median_m": float(median), f"{stems[name]}/p90_m": float(p90)}
-    draw_errors(errors, run_dir / "errors.png")
-    keys = ("median_m", "p90_m")
-    rows = [[name, *(f"{facts[f'{stems[name]}/{key}']:.3g}" for key in keys)] for name in errors]
+    for name in dict.fromkeys(against):
+        if name not in places:
+            stems[name] = stem = f"baseline/{name}"
+            beside = located_by(name, result.trained, heard)
+            places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
+    rows = []
+    for name, place in places.items():
+        median, p90 = np.quantile(np.linalg.norm(place - heard.place, axis=1), [0.5, 0.9]).tolist()
+        facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
+        rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
+    shown = [table(title, ["method"], ["median [m]", "p90 [m]"], rows)]
+    facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
+    if result.inside is None:
+        return facts, shown, []
     sentence = (
-        f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places, "
-        f"{result.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
+        f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
+        f"{result.promise}; {result.each_ms:.3g} ms a snapshot"
     )
-    return facts, [table(title, ["method"], ["median [m]", "p90 [m]"], rows)], [sentence]
+    return facts, shown, [sentence]
 
 
 def by_model(
@@ -155,13 +148,23 @@ def by_model(
         if config.store:
             keep(config.ckpt, locating.trust_state(trust, unknown, share))
     heard, placed = _snapshots(config, run)
-    answers, trained = {method.name: locator.locate(heard)}, snapshots(data, learned)
+    located, trained, origin = locator.locate(heard), snapshots(data, learned), data.site.origin
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
-    if config.track:
-        answers["alone"], promise = answers[method.name], "of a track nothing is promised"
-        answers[method.name] = followed(answers["alone"], trained, heard, level)
+    true = heard.place + origin if placed else None
+    shown_at = [locating.in_world(one, origin) for one in located]
+    draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
+    pairs = zip(located, heard.place, strict=True)
+    inside = np.array([one.posterior.level(at) <= level for one, at in pairs]) if placed else None
+    places = np.array([one.place for one in located])
+    about: dict[str, list[Any]] = {
+        "area_m2": [one.area for one in located],
+        "modes": [one.modes for one in located],
+    }
+    each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count}
-    return Localisation(answers, heard, trained, data.site.origin, placed, level, promise, facts)
+    return Localisation(
+        method.name, places, heard, trained, origin, placed, about, inside, each_ms, promise, facts
+    )
 
 
 def _trust(
@@ -193,58 +196,11 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), site)
         heard = snapshots(other, np.arange(len(other)))
-    return heard.at(_sample(config, len(heard))), placed
+    return heard.at(sample(config, len(heard))), placed
 
 
-def by_fingerprints(config: DictConfig) -> Localisation:
-    """Learn a field of fingerprints, and locate rows that it did not learn from.
-
-    Args:
-        config: see conf/locate.yaml.
-
-    Raises:
-        ValueError: no file, a checkpoint as well, or rows that cannot be followed.
-    """
-    chosen, seed, groups = config.dataset, int(config.seed), int(config.calibrate)
-    if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
-        raise ValueError("dataset=fingerprints learns its own field: give dataset.file=FILE, and no ckpt")
-    POSITIVE.check("dataset.side_m", chosen.side_m)
-    SHARE.check("dataset.held_out", chosen.held_out)
-    rows = read_fingerprints(chosen.file)
-    if config.track and not rows.time_s.any():
-        raise ValueError(f"track=true: {chosen.file} does not say when its rows were heard (time_s)")
-    how: Any = "file" if config.data else chosen.split
-    cut = float(chosen.side_m), float(chosen.held_out)
-    if config.data:
-        known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
-    else:
-        known, heard = map(rows.at, parted(rows, how, *cut, seed))
-    heard = heard.at(_sample(config, len(heard.level)))
-    # Devices of one building differ by some 6 dB: an offset that is integrated out.
-    offset = DEVICES_DB if config.offset_db is None else float(config.offset_db)
-    started = time.perf_counter()
-    locator = FingerprintLocator.of(known, offset, config.prior == "trained", bool(config.track))
-    facts = {
-        "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
-        "split/name": how, "split/train": len(known.level), "locate/calibrated_on": 0,
-        "time/fit_s": time.perf_counter() - started,
-    }  # fmt: skip
-    promise = "nothing is promised without calibration, or of another campaign"
-    if groups:
-        # Held-out rows promise something only of rows drawn as they are.
-        random, share = how in ("random", "places", "blocks", "walks"), float(config.share)
-        inner: Any = how if random else "places"
-        locator, facts["locate/calibrated_on"] = trusted(locator, known, inner, *cut, groups, share, seed)
-        promise = f"{share:.0%} are promised" if random else promise
-    answers = {"field": locator.locate(heard)}
-    if config.track:
-        answers["alone"] = replace(locator, speed=None, point=SHARED).locate(heard)
-    both, placed = (as_snapshots(heard), as_snapshots(known)), bool(np.isfinite(heard.position).all())
-    return Localisation(answers, *both, np.zeros(3), placed, locator.area.level, promise, facts)
-
-
-def _sample(config: DictConfig, count: int) -> np.ndarray:
-    """Numbers of at most `rows` of so many rows, drawn evenly."""
+def sample(config: DictConfig, count: int) -> np.ndarray:
+    """Return numbers of at most `rows` of so many rows, drawn evenly."""
     if not count:
         raise ValueError("there is nothing to be located")
     # Sorted, since rows of a track must stay in the order of time.
@@ -283,17 +239,4 @@ def draw_posteriors(
         axis.set(xlabel="x [m]", ylabel="y [m]")
         axis.set_title(f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9)
     axes.flat[0].legend(fontsize=7)
-    save(figure, path)
-
-
-def draw_errors(errors: Mapping[str, np.ndarray], path: Path) -> None:
-    """Share of snapshots located to within an error [m], a line a method, as one PNG."""
-    figure, ((axis,),) = panels(6, 4)
-    for name, values in errors.items():
-        label = f"{name}, median {np.median(values):.3g} m"
-        # .1 mm stands for no error at all on a logarithmic axis.
-        axis.ecdf(np.maximum(values, 1e-4), color=look(name).colour, label=label)
-    logarithmic(axis)
-    axis.set(xlabel="error [m]", ylabel="share of snapshots", ylim=(0, 1))
-    axis.legend(fontsize=8)
     save(figure, path)

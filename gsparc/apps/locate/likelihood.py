@@ -44,11 +44,6 @@ class Misfit:
         """Return the misfit at places (g,) by number."""
         return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 
-    def of(self, snapshot: int) -> Misfit:
-        """Return the misfit of one snapshot."""
-        one = slice(snapshot, snapshot + 1)
-        return Misfit(self.squared[one], self.size[one], self.count[one], self.silent[one])
-
 
 @dataclass(frozen=True)
 class Trust:

@@ -11,17 +11,13 @@ import torch
 from gsparc.apps.maps.levels import joint_of
 from gsparc.apps.maps.making import levels_at, local_of
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.models.method import HasJoint, HasProcess
-from gsparc.models.powers.settings import fit_powers
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, Rows
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
-LEARNED = 1000  # predictions that stand for a model without a process of its own
 SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
 SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are alike, where nobody says it
 
@@ -62,12 +58,12 @@ def unknown_of(
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:
-    """Return error covariances at world places (S, 3) [m] of every station, by its process or predictions.
+    """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
     Held-out blocks of `promise` scale the variances.
 
     Raises:
-        DataError: the model has neither a process nor known places.
+        DataError: the model has no process.
     """
     covariances = []
     joint = joint_of(predictor.method)
@@ -79,7 +75,11 @@ def unknown_of(
             covariance, noise = _of_cell(joint, local, number)
         else:
             process = asking.method.process() if isinstance(asking.method, HasProcess) else None
-            process = _stand_in(asking, promise, number) if process is None else process
+            if process is None:
+                name = asking.method.name
+                raise DataError(
+                    f"{name} states no covariance of its errors; plan with model=gp or gsparc of powers"
+                )
             local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
             assert isinstance(process.posterior, Exact)
             covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
@@ -113,23 +113,3 @@ def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCo
     at = torch.from_numpy(places)
     prior = variance * (Kernel.of_one(length, NOISE).between(at, at) + 1)
     return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
-
-
-def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
-    """A process of what the model predicts at places it knows."""
-    if promise is None:
-        raise DataError(
-            f"{asking.method.name} states no covariance, and the model does not say where was measured; "
-            "run gsparc map on it first, which stores it"
-        )
-    own = promise.known[promise.station == number]
-    if not len(own):
-        own = promise.known
-    own = own[evenly(len(own), LEARNED)]
-    if own.shape[1] == 6:
-        raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
-    world = own + asking.site.origin
-    level, _ = levels_at(asking, world)
-    good = np.isfinite(level)
-    rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
-    return fit_powers(rows, asking.site, "constant")[0].exact()

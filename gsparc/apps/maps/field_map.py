@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from scipy.stats import norm
@@ -41,7 +40,7 @@ class FieldMap:
         share: of measurements that the intervals hold; the field alone lies in them more often.
         calibrated: whether held-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
-        extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`, `overlap`.
+        extra: further layers (ny, nx) by name: `overlap` of several stations.
         places: (n, 2) where was measured, world [m].
         station_place: (T, 2) world [m], NaN where unknown.
         notes: what a reader must know, one line each.
@@ -111,32 +110,6 @@ class FieldMap:
         }  # fmt: skip
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
-
-    @classmethod
-    def read(cls, path: str | Path) -> FieldMap:
-        """Return what `save` wrote; it does not hold measured places, stations' places and notes.
-
-        Raises:
-            DataError: no such file, or not one of a map.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            x, y, inside = arrays.pop("x"), arrays.pop("y"), arrays.pop("inside")
-            # A map of a single cell has no step to be read: 1 m.
-            step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
-            grid = Grid(x, y, float(arrays.pop("height")), step, inside)
-            names = tuple(str(name) for name in arrays.pop("stations"))
-            facts: dict[str, Any] = {name: arrays.pop(name) for name in ARRAYS}
-            facts["unit"], facts["bands"] = str(arrays.pop("unit", "dB")), tuple(arrays.pop("bands", ()))
-            for name, kind in (("share", float), ("calibrated", bool), ("threshold_db", float)):
-                facts[name] = kind(arrays.pop(name))
-        except FileNotFoundError:
-            raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
-        # BadZipFile and EOFError: a file cut off while it was copied.
-        except (KeyError, ValueError, OSError, EOFError, BadZipFile):
-            raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
-        return cls(grid=grid, stations=names, extra=arrays, **facts)
 
     def figures(self) -> dict[str, float | int | str | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
@@ -268,26 +241,25 @@ def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequenc
     return np.broadcast_to(values, (len(stations),))
 
 
-def geotiff_wanted(wanted: bool | None, origin: Georeference | None) -> bool:
+def geotiff_wanted(wanted: bool | None) -> bool:
     """Return whether a GeoTIFF is written; None: where it can be.
 
     Raises:
         DataError: it is asked for, and cannot be.
     """
     there = find_spec("rasterio") is not None
-    if wanted and origin is None:
-        raise DataError("geotiff=true: positions were in metres about an unknown origin, not in degrees")
     if wanted and not there:
         raise DataError("geotiff=true: needs rasterio; pip install 'gsparc[maps]'")
-    return there and origin is not None and wanted is not False
+    return there and wanted is not False
 
 
-def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference) -> None:
+def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | None) -> None:
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
     `outage`, `best_server` (number of the station), `server_chance`, and then the power of each of several
-    stations. The projection is the one that `Georeference` describes, azimuthal equidistant about its place.
+    stations. The projection is the one that `Georeference` describes, azimuthal equidistant about its place;
+    without an `origin` there is none, and coordinates are metres.
     """
     import rasterio
     from rasterio.transform import from_origin
@@ -298,9 +270,8 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference) -> N
             f"power_db {name}": power for name, power in zip(raster.stations, raster.power_db, strict=True)
         }
     left, _, _, high = raster.grid.extent
-    place = (
-        f"+proj=aeqd +lat_0={origin.latitude!r} +lon_0={origin.longitude!r} +datum=WGS84 +units=m +no_defs"
-    )
+    here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
+    place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"
     profile = {
         "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": len(bands),
         "dtype": "float32", "crs": place, "nodata": float("nan"), "compress": "deflate", "tiled": True,

@@ -139,9 +139,7 @@ def map_of(
             f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
             "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
         )
-    extra = _path_layers(predictor, grid, values["best_server"])
-    if len(names) > 1:
-        extra["overlap"] = overlap.reshape(grid.shape)
+    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.shape)}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, tuple(names), **values, share=share, calibrated=promise is not None,
@@ -215,8 +213,7 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
     if len(places) < 2:
         return 1
     apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
-    # A power of two, since cells between are filled by halving.
-    return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
+    return max(int(apart / grid.step / 2), 1)
 
 
 def _asker(
@@ -328,29 +325,6 @@ def _usual(
             # 1 %, not the least: one faulty row would place the floor anywhere.
             floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
     return usual, floor
-
-
-def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:
-    """Delay spread [ns] and azimuth [deg] of the strongest path (ny, nx), of models with paths."""
-    if predictor.site.stations is not None:
-        return {}
-    layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
-    for cells in _chunks(np.flatnonzero(best >= 0), CHUNK):
-        try:
-            paths = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
-        except ValueError:  # of another kind, or what was fitted has none
-            return {}
-        power = np.abs(paths.gain).astype(np.float64) ** 2
-        power, delay = power.mean(axis=1), np.asarray(paths.delay_s, np.float64).mean(axis=1)
-        share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
-        middle = (share * delay).sum(axis=1, keepdims=True)
-        spread = np.sqrt((share * (delay - middle) ** 2).sum(axis=1))
-        layers["delay_spread_ns"].reshape(-1)[cells] = spread * 1e9
-        if paths.direction is not None:
-            towards = paths.direction[np.arange(len(cells)), power.argmax(axis=1)]
-            azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
-            layers["direction_deg"].reshape(-1)[cells] = azimuth
-    return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}
 
 
 def bands_of(site: Site, numbers: np.ndarray) -> tuple[str, ...]:

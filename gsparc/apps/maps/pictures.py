@@ -20,7 +20,6 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.placing import Placing
 from gsparc.apps.maps.planning import Plan
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.links.georeference import Georeference
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import (
     OUTLINE,
@@ -29,7 +28,6 @@ from gsparc.evaluation.from_above import (
     draw_measured,
     draw_sectors,
     draw_stations,
-    in_degrees,
     legend_below,
     scale_bar,
 )
@@ -163,12 +161,6 @@ def layers(field: FieldMap) -> Iterator[Layer]:
     if "overlap" in field.extra:
         label = f"stations within {OVERLAP_DB:g} dB of the strongest, on its carrier"
         yield Layer("overlap", field.extra["overlap"], Legend(label, 1.0, MOST_OVERLAP, "YlOrRd"))
-    if "delay_spread_ns" in field.extra:
-        layer = field.extra["delay_spread_ns"]
-        yield Layer("delay_spread_ns", layer, Legend.over("delay spread [ns]", layer, "plasma"))
-    if "direction_deg" in field.extra:
-        legend = Legend("azimuth of the strongest path [degrees]", -180.0, 180.0, "twilight")
-        yield Layer("direction_deg", field.extra["direction_deg"], legend)
     for name, layer in zip(field.stations, field.power_db, strict=True) if several else ():
         if np.isfinite(layer).any():
             yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
@@ -185,11 +177,8 @@ def file_name(layer: Layer) -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
 
 
-def draw_layer(
-    field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None,
-    degrees: Georeference | None = None,
-) -> None:  # fmt: skip
-    """Save one layer as PNG, over a floor plan; with axes in degrees where `degrees` says how."""
+def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
+    """Save one layer as PNG, over a floor plan."""
     left, right, low, high = field.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
@@ -211,8 +200,6 @@ def draw_layer(
     bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, field)
     scale_bar(axis)
-    if degrees is not None:
-        in_degrees(axis, degrees)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
     legend_below(figure)
@@ -309,10 +296,13 @@ def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = 
     """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
-    label = f"share of the area with {threshold_db:g} {unit} or more"
-    label = label if placing.what == "coverage" else f"power that nine tenths of the area exceed [{unit}]"
-    dots = axis.scatter(*placing.places[:, :2].T, c=placing.goal, s=60, marker="s", cmap="viridis")
-    figure.colorbar(dots, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
+    figure.colorbar(
+        dots,
+        ax=axis,
+        label=f"share of the area with {threshold_db:g} {unit} or more, with a station here",
+        shrink=0.85,
+    )
     draw_stations(axis, placing.stations)
     draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
     bounded(axis, (left, low), (right, high))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -16,14 +16,11 @@ from gsparc.apps.maps.promise import Promise, evidence_of
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.limits import check_arguments, choice, whole
+from gsparc.data.limits import check_arguments, whole
 from gsparc.data.splits import Fold
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
-Goal = Literal["coverage", "worst"]
-# A tenth of the area may lie below it: the least of all cells would be one behind a wall.
-DECILE = 0.1
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
 
@@ -49,22 +46,19 @@ class Placing:
 
     Attributes:
         places: (n, 3) world [m].
-        goal: (n,) with a station there; `coverage`: share of the area, `worst`: power that nine tenths of it
-            exceed [dB].
+        coverage: (n,) expected share of the area with the threshold or more, with a station there.
         low, high: (n,) the ends of its 90 % interval.
-        before: the goal as it is.
-        what: `coverage` or `worst`.
+        before: the share as it is.
         grid: the area.
         stations: (T, 2) that stand already [m].
         error: of stations left out.
     """
 
     places: np.ndarray
-    goal: np.ndarray
+    coverage: np.ndarray
     low: np.ndarray
     high: np.ndarray
     before: float
-    what: Goal
     grid: Grid
     stations: np.ndarray
     error: NewStation
@@ -74,7 +68,6 @@ def place_next(
     predictor: Predictor,
     area: Any = None,
     *,
-    goal: Goal = "coverage",
     threshold_db: float = -100.0,
     height_m: float | None = None,
     sites: Any = None,
@@ -89,7 +82,6 @@ def place_next(
     Args:
         predictor: of powers at several stations, learned together.
         area, height_m, threshold_db: see `map_of`.
-        goal: `coverage`, the expected share of the area with `threshold_db` or more, or `worst`.
         sites: GeoJSON of where a station may stand: polygons or lines; None: the whole area.
         station_height_m: world; None: the middle height of the stations that stand.
         count: candidates, about.
@@ -101,7 +93,7 @@ def place_next(
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
     """
     site = predictor.site
-    check_arguments(locals(), goal=choice(*get_args(Goal)), count=whole(1))
+    check_arguments(locals(), count=whole(1))
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: the model of {site.name} knows no stations among which to put another")
     grid = coarse_grid(predictor, area, height_m)
@@ -124,7 +116,6 @@ def place_next(
         dry=dry,
     )
     flat = grid.inside.reshape(-1)
-    old_power = np.nan_to_num(now.strongest(now.power_db).reshape(-1)[flat], nan=-np.inf)
     old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)
     error = error or NewStation()
 
@@ -133,9 +124,6 @@ def place_next(
         goals = np.empty(3)
         # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
-            if goal == "worst":
-                goals[k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
-                continue
             wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
             outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
             goals[k] = np.mean(1 - np.minimum(old_outage, outage))
@@ -144,10 +132,10 @@ def place_next(
     scores = np.empty((len(candidates), 3))
     for row, goals in each(tried, list(candidates), "candidates"):
         scores[row] = goals
-    before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
+    before = float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
     value, low, high = scores[order].T
-    return Placing(candidates[order], value, low, high, before, goal, grid, still[:, :2], error)
+    return Placing(candidates[order], value, low, high, before, grid, still[:, :2], error)
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStation:
@@ -197,15 +185,3 @@ def unheard_stations_error(what: str) -> DataError:
         f"{what}: answers only for the stations that it heard; train with stations=together, for example "
         "model=gp or distance_law"
     )
-
-
-def number(what: Goal, value: float, unit: str = "dB") -> str:
-    """Return a goal's value with its unit."""
-    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} {unit}"
-
-
-def in_words(what: Goal, value: float, threshold_db: float, unit: str = "dB") -> str:
-    """Return a goal's value in words."""
-    if what == "coverage":
-        return f"{number(what, value)} of the area with {threshold_db:g} {unit} or more"
-    return f"nine tenths of the area have {number(what, value, unit)} or more"

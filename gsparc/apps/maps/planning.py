@@ -140,7 +140,7 @@ def plan_next(
     chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     walk = route or route_m is not None
-    order = tour.order() if walk else np.arange(len(chosen))
+    order = tour.number if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
@@ -260,9 +260,6 @@ def _start(value: Sequence[float]) -> np.ndarray:
     return place[:2]
 
 
-ROUNDS = 50
-
-
 class Tour:
     """An open walk that grows place by place.
 
@@ -287,13 +284,6 @@ class Tour:
         at = int(self._longer(place[None, :2])[:, 0].argmin())
         self.stops = np.insert(self.stops, at, place[:2], axis=0)
         self.number = np.insert(self.number, at, len(self.number))
-        if self.longest is not None:
-            self._shorten()
-
-    def order(self) -> np.ndarray:
-        """Numbers (n,) int64 of the places, as they were added, in the order of the walk."""
-        self._shorten()
-        return self.number
 
     @staticmethod
     def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
@@ -312,23 +302,6 @@ class Tour:
         to = _apart(stops[:, None], places)
         # Cheapest insertion: the way over the new place less the way there was.
         return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
-
-    def _shorten(self) -> None:
-        """Turn stretches of the walk round (G. A. Croes, Oper. Res. 6 (1958)) while that helps."""
-        stops = self._ends()
-        apart, walk = _apart(stops[:, None], stops), list(range(len(stops)))
-        for _ in range(ROUNDS):
-            before = list(walk)
-            for i in range(1, len(walk) - 2):
-                for j in range(i + 1, len(walk) - 1):
-                    a, b, c, d = walk[i - 1], walk[i], walk[j], walk[j + 1]
-                    # 1e-9 m: equal exchanges would go round for ever.
-                    if apart[a, c] + apart[b, d] < apart[a, b] + apart[c, d] - 1e-9:
-                        walk[i : j + 1] = walk[i : j + 1][::-1]
-            if walk == before:
-                break
-        # Stop 0 is the start, hence places are numbered one less.
-        self.stops, self.number = stops[walk[1:-1]], self.number[np.array(walk[1:-1], int) - 1]
 
 
 def _apart(one: np.ndarray, two: np.ndarray) -> np.ndarray:

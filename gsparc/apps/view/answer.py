@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.levels import predicted
-from gsparc.data.schema import Site
 from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
@@ -27,8 +26,6 @@ class Answer:
         confidence: in [0, 1]; None where the method has none.
         spectrum: (H, W) in [0, 1]; None of other kinds.
         response: (A, K) complex channel; None of other kinds.
-        strongest: azimuth and elevation of the strongest direction of a spectrum, at the receiver as a
-            picture of it has them, and in the world [degrees].
         paths: None where there are none.
     """
 
@@ -38,7 +35,6 @@ class Answer:
     confidence: float | None = None
     spectrum: np.ndarray | None = None
     response: np.ndarray | None = None
-    strongest: tuple[float, float, float, float] | None = None
     paths: Rays | None = None
 
 
@@ -76,7 +72,7 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
         {**still, **ends}, level, spread,
         None if prediction.confidence is None else float(prediction.confidence[0]),
         mean if kind == "spectrum" else None, mean if kind == "csi" else None,
-        _strongest(mean, site) if kind == "spectrum" else None, _rays(predictor, ends),
+        _rays(predictor, ends),
     )  # fmt: skip
 
 
@@ -84,15 +80,6 @@ def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
     """Return azimuth and elevation of a direction (3,) [degrees]."""
     x, y, z = towards
     return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
-
-
-def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float, float, float]:
-    assert site.grid is not None
-    towards = site.grid.directions().numpy().reshape(-1, 3)[int(spectrum.argmax())]
-    azimuth, elevation = azimuth_elevation(towards)
-    left = site.grid.edges()[0]
-    world = azimuth_elevation(towards if site.rx_rotation is None else site.rx_rotation @ towards)
-    return left + (azimuth - left) % 360, elevation, *world
 
 
 def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:

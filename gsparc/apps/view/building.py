@@ -8,56 +8,39 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
-from gsparc.apps.view.crossed import fans
-from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.data.walls import SceneWalls, box_faces
+from gsparc.data.walls import box_faces
 
 log = logging.getLogger(__name__)
 
 WORDS = ("transmitter", "receiver")  # that stand still
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
+DOT = 0.01  # width of a measured place, of the extent of the site
 DIRECTIONS = 9000  # of a sphere of power, at most
 QUERIES = 16  # places at which Gaussians are asked what they emit
 RANGE_DB = 30.0  # of emissions that are told apart
 RADIUS = 0.08  # of a sphere of power, of the extent of the site
-SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
 BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
 REACH = 0.8  # of the extent, that rays are drawn to at most
-MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
-SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known walls"}
+MIRROR, BOX = (205, 92, 92), (31, 119, 180)
+SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes that were found"}
 PATHS = Legend(
     "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
 )
-VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
-    "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
-)  # fmt: skip
+VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
-@dataclass(frozen=True)
-class Building:
-    """What is known of a site besides its model.
-
-    Attributes:
-        plan: of the floor, beneath all.
-        walls: known walls and boxes.
-    """
-
-    plan: FloorPlan | None = None
-    walls: SceneWalls | None = None
-
-
-def build(viewed: Viewed, building: Building, station: str | None, measured: Measured | None) -> Scene:
+def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
     points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
@@ -67,15 +50,13 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    ground = ground_of(viewed, building)
-    if building.plan is not None:
-        corners = np.column_stack([building.plan.corners(), np.full(4, ground - BENEATH * extent)])
+    ground = ground_of(viewed)
+    if plan is not None:
+        corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(Sheet("floor plan", corners[0], *edges, building.plan.image))
-    if building.walls is not None:
-        parts += walls_faces(building.walls)
+        parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
     if measured is not None:
-        parts += _measured_parts(measured, legends, extent)
+        parts.append(_measured_part(measured, legends, extent))
     for name in viewed.stations:
         place = viewed.still(name)
         if place is not None:
@@ -84,67 +65,39 @@ def build(viewed: Viewed, building: Building, station: str | None, measured: Mea
             parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
-    parts += [
-        _mesh(f"mirror {number}", [_square(plane, frame.middle - origin, extent) + origin], MIRROR, 0.12)
-        for number, plane in enumerate(objects.planes)
-    ]
-    parts += _boxes("box", objects.boxes + origin)
+    for number, plane in enumerate(objects.planes):
+        square = _square(plane, frame.middle - origin, extent) + origin
+        parts.append(_mesh(f"mirror {number}", [square], MIRROR, 0.12))
+    for number, box in enumerate(objects.boxes + origin):
+        parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
-        parts += _cloud_parts(cloud, legends, extent)
-    hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
+        parts.append(_cloud_part(cloud, legends, extent))
     faces = np.array(box_faces(*viewed.box()))
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
     parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
-    return Scene(title, frame, tuple(parts), beneath, legends, hidden, viewed.notes)
+    return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
 
 
-def ground_of(viewed: Viewed, building: Building) -> float:
-    """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
-    low = [float(viewed.box()[0, 2])]
-    if viewed.site.kind in MAPPED:
-        low.append(viewed.heights()[0])
-    if building.walls is not None:
-        low += [float(face[:, 2].min()) for face in building.walls.faces]
-        low += [float(box[0, 2]) for box in building.walls.boxes]
-    return min(low)
+def ground_of(viewed: Viewed) -> float:
+    """Height beneath which nothing is shown [m]: of measured places and planes."""
+    return min(float(viewed.box()[0, 2]), viewed.heights()[0] if viewed.site.kind in MAPPED else np.inf)
 
 
-def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
+def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
     chosen = evenly(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
-    size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
-    parts: list[Part] = [Points(VALUES, places, legends[VALUES].of(values), size)]
-    if np.isfinite(measured.errors).any():
-        few = np.flatnonzero(np.isfinite(measured.errors))
-        psnr = measured.error_label.startswith("PSNR")
-        legends[ERRORS] = Legend.over(measured.error_label, measured.errors, "magma" if psnr else "magma_r")
-        colours = legends[ERRORS].of(measured.errors[few])
-        parts.append(Points(ERRORS, measured.places[few], colours, 1.4 * size))
-    return parts
+    return Points(VALUES, places, legends[VALUES].of(values), DOT * extent)
 
 
-def dot_size(places: np.ndarray, extent: float) -> float:
-    """Width of dots [m]: the distance between neighbours, within bounds that can be seen."""
-    apart = extent / 100
-    if len(places) > 1:
-        distance = cKDTree(places).query(places[:: max(1, len(places) // 2000)], k=2)[0][:, 1]
-        apart = float(np.median(distance[distance > 0])) if (distance > 0).any() else apart
-    return float(np.clip(apart, extent / 250, extent / 80))
-
-
-def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> list[Part]:
-    legend, colours = cloud_colours(cloud)
-    legends[GAUSSIANS] = legends[SPLATS] = legend
+def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
+    legends[GAUSSIANS], colours = cloud_colours(cloud)
     size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
-    return [
-        Points(GAUSSIANS, cloud.means, colours, size),
-        Splats(SPLATS, cloud.means, cloud.covariances(), colours, SHADE * cloud.opacities),
-    ]
+    return Points(GAUSSIANS, cloud.means, colours, size)
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
@@ -180,21 +133,9 @@ def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
 
 
 def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
-    """Flat faces (C, 3) as triangles."""
-    triangles = fans(faces)
-    return Faces(
-        name, triangles.reshape(-1, 3), np.arange(triangles.size // 3).reshape(-1, 3), colour, opacity
-    )
-
-
-def walls_faces(walls: SceneWalls) -> list[Part]:
-    """Known walls as one mesh, and boxes."""
-    parts: list[Part] = [_mesh("walls", walls.faces, WALL, 0.4)] if walls.faces else []
-    return parts + _boxes("known box", walls.boxes)
-
-
-def _boxes(name: str, boxes: np.ndarray) -> list[Part]:
-    return [_mesh(f"{name} {number}", box_faces(*box), BOX, 0.35) for number, box in enumerate(boxes)]
+    """Flat faces (C, 3) as triangles, each face a fan about its first corner."""
+    fans = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
+    return Faces(name, np.array(fans).reshape(-1, 3, 3), colour, opacity)
 
 
 @dataclass(frozen=True)

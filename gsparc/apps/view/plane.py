@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.making import levels_at
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.reasons import Usual
 from gsparc.apps.view.scene import Sheet
 from gsparc.prediction.predictor import Predictor
 
@@ -35,14 +34,6 @@ class Plane:
     grid: Grid
     level_db: np.ndarray
     stride: int
-
-
-def thinned(grid: Grid, most: int) -> Grid:
-    """Return at most about `most` cells along the longer side, of every n-th row and column."""
-    every = max(1, -(-max(grid.shape) // most))
-    return Grid(
-        grid.x[::every], grid.y[::every], grid.height, grid.step * every, grid.inside[::every, ::every]
-    )
 
 
 def refining(
@@ -107,11 +98,3 @@ def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
     if not np.isfinite(level).any():
         return None
     return plane.grid.places(np.array([int(np.nanargmin(level))]))[0]
-
-
-def beyond_distance(plane: Plane, known: Usual, other: np.ndarray) -> Plane:
-    """Return what is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
-    grid = plane.grid
-    cells = np.arange(plane.level_db.size)
-    distance = np.linalg.norm(grid.places(cells) - other, axis=1).reshape(grid.shape)
-    return replace(plane, level_db=plane.level_db - known.at(distance))

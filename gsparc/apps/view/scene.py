@@ -1,13 +1,17 @@
-"""What is drawn, as plain arrays: points, lines, Gaussians, faces, pictures and marks in world metres."""
+"""What is drawn, as plain arrays: points, lines, faces, pictures and marks in world metres."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsparc.apps.maps.pictures import Legend
 
+THICKNESS = 1.5  # of lines [pixels]
+STATION = (40, 40, 40)
 EXTENT = 10.0  # of a site in drawn units: near and far planes, controls and camera are then alike everywhere
 
 
@@ -49,6 +53,13 @@ class Points:
     colours: np.ndarray
     size: float
 
+    def draw(self, api: Any, frame: Frame) -> Any:
+        """Add it to a scene of viser under its name, in place of what had it; returns viser's handle."""
+        return api.add_point_cloud(
+            path_of(self.name), frame.drawn(self.places), self.colours, point_size=self.size * frame.scale,
+            point_shape="circle", precision="float32", point_shading="flat",
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Lines:
@@ -58,27 +69,29 @@ class Lines:
     segments: np.ndarray
     colours: np.ndarray
 
-
-@dataclass(frozen=True)
-class Splats:
-    """Gaussians of means (n, 3) [m], covariances (n, 3, 3) [m^2], colours (n, 3) uint8, opacities (n,)."""
-
-    name: str
-    means: np.ndarray
-    covariances: np.ndarray
-    colours: np.ndarray
-    opacities: np.ndarray
+    def draw(self, api: Any, frame: Frame) -> Any:
+        """See `Points.draw`."""
+        places, colours = frame.drawn(self.segments), np.repeat(self.colours[:, None], 2, axis=1)
+        how = {"thickness": THICKNESS, "thickness_units": "screen"}
+        return api.add_line_segments(path_of(self.name), places, colours, **how)
 
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles (f, 3) between vertices (v, 3) [m], in one colour."""
+    """Triangles (f, 3, 3) [m], in one colour."""
 
     name: str
-    vertices: np.ndarray
     triangles: np.ndarray
     colour: tuple[int, int, int]
     opacity: float
+
+    def draw(self, api: Any, frame: Frame) -> Any:
+        """See `Points.draw`."""
+        corners = frame.drawn(self.triangles).reshape(-1, 3)
+        return api.add_mesh_simple(
+            path_of(self.name), corners, np.arange(len(corners)).reshape(-1, 3), color=self.colour,
+            opacity=self.opacity, side="double", flat_shading=True, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,18 @@ class Sheet:
     down: np.ndarray
     image: np.ndarray
 
+    def draw(self, api: Any, frame: Frame) -> Any:
+        """See `Points.draw`."""
+        wide, tall = np.linalg.norm(self.right), np.linalg.norm(self.down)
+        # A picture's columns run along x of its node, its rows along y.
+        x, y = self.right / wide, self.down / tall
+        turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
+        return api.add_image(
+            path_of(self.name), self.image, float(wide * frame.scale), float(tall * frame.scale),
+            cast_shadow=False, receive_shadow=False, wxyz=turn,
+            position=frame.drawn(self.corner + (self.right + self.down) / 2),
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Mark:
@@ -104,8 +129,21 @@ class Mark:
     place: np.ndarray
     text: str
 
+    def draw(self, api: Any, frame: Frame) -> Any:
+        """See `Points.draw`."""
+        name, where = path_of(self.name), frame.drawn(self.place)
+        ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=where)
+        if self.text:
+            api.add_label(f"{name}/name", self.text, position=(0, 0, 0.02 * EXTENT), anchor="bottom-center")
+        return ball
 
-Part = Points | Lines | Splats | Faces | Sheet | Mark
+
+def path_of(name: str) -> str:
+    """Return the path of a node, its name without what separates nodes."""
+    return "/" + name.replace("/", " ")
+
+
+Part = Points | Lines | Faces | Sheet | Mark
 
 
 @dataclass(frozen=True)
@@ -118,7 +156,6 @@ class Scene:
         parts: what is drawn.
         ground: height of a grid beneath all [m].
         legends: of parts, by their names.
-        hidden: names of parts that are drawn when asked for.
         notes: what a reader must know, one line each.
     """
 
@@ -127,7 +164,6 @@ class Scene:
     parts: tuple[Part, ...]
     ground: float
     legends: dict[str, Legend] = field(default_factory=dict)
-    hidden: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def part(self, name: str) -> Part | None:

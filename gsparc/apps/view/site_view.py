@@ -8,18 +8,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
-from gsparc.apps.maps.pictures import Layer, Legend
-from gsparc.apps.view.building import VALUES, Building, Sphere, build, start_place
-from gsparc.apps.view.crossed import Obstacles
+from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.view.building import VALUES, Sphere, build, start_place
 from gsparc.apps.view.plane import Plane, refining
-from gsparc.apps.view.reasons import Surroundings, usual
 from gsparc.apps.view.scene import EXTENT, Points, Scene
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
-from gsparc.data.walls import SceneWalls
 
 
 @dataclass(frozen=True)
@@ -29,13 +28,13 @@ class StationView:
     Attributes:
         scene: what stands still.
         measured: of the station; None without data.
-        about: what is known of its places.
+        tree: see `reasons`.
         power: colours of powers: as those of the measured points, where there are any.
     """
 
     scene: Scene
     measured: Measured | None
-    about: Surroundings
+    tree: cKDTree | None
     power: Legend | None
 
     @property
@@ -51,17 +50,15 @@ class SiteView:
 
     Attributes:
         viewed: the model.
-        building: floor plan and walls.
+        plan: of the floor, beneath all.
         grid: cells of planes; None where no power is predicted.
-        layers: of a map that was made before, with its cells.
         at: world place where the moving end first stands; None: chosen.
         other: the same of the transmitter, where both move.
     """
 
     viewed: Viewed
-    building: Building = field(default_factory=Building)
+    plan: FloorPlan | None = None
     grid: Grid | None = None
-    layers: tuple[tuple[Grid, Layer], ...] = ()
     at: np.ndarray | None = None
     other: np.ndarray | None = None
     _made: dict[str | None, StationView] = field(default_factory=dict)
@@ -88,20 +85,12 @@ class SiteView:
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
         measured = viewed.measured(name)
-        scene = build(viewed, self.building, name, measured)
-        known, values = None, np.zeros(0)
-        if measured is not None:
-            values = measured.values
-            levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
-            known = usual(measured.places, levels, viewed.others(name))
+        scene = build(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        faces = () if self.building.walls is None else self.building.walls.faces
-        boxes = viewed.predictor_of(name).method.objects().boxes + viewed.site.origin
-        if self.building.walls is not None:
-            boxes = np.concatenate([boxes, self.building.walls.boxes])
-        walls = Obstacles.of(SceneWalls(faces, boxes)) if len(faces) or len(boxes) else None
-        about = Surroundings(known, values, walls, self.unit)
-        return StationView(scene, measured, about, power)
+        tree = None
+        if measured is not None and viewed.site.static_end is not None:
+            tree = cKDTree(measured.places)
+        return StationView(scene, measured, tree, power)
 
     def extent(self, name: str | None) -> float:
         """Width of the site [m]."""

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from gsparc.apps.maps import levels
 from gsparc.apps.maps.making import answering
-from gsparc.data.blocks import evenly
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import aligned, open_files
 from gsparc.prediction.operating_point import load
@@ -21,11 +19,8 @@ from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
 
-MOST_ERRORS = 2000  # test rows that errors are drawn of
 LEAST_HEIGHT_M = 0.5  # of a site, between whose floor and ceiling planes are lifted
 CHUNK = 128  # rows of one call
-# 60 dB: a perfect spectrum has no finite PSNR.
-LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
 
 
 @dataclass(frozen=True)
@@ -36,15 +31,11 @@ class Measured:
         places: (n, 3) world, of the moving end [m].
         values: (n,) level [dB], or mean of a spectrum; NaN where nothing was heard.
         label: of the values.
-        errors: (n,) of test rows, NaN for the others.
-        error_label: of the errors.
     """
 
     places: np.ndarray
     values: np.ndarray
     label: str
-    errors: np.ndarray
-    error_label: str
 
 
 @dataclass(frozen=True)
@@ -55,7 +46,6 @@ class Viewed:
         name: of the checkpoint.
         predictor: as trained.
         data: in the model's coordinates and units; None where they are gone.
-        test: (n,) rows that were not learned from.
         stations: that it answers for; one, None, where there is one static end or none.
         notes: what a reader must know, one line each.
         unit: of powers.
@@ -64,7 +54,6 @@ class Viewed:
     name: str
     predictor: Predictor
     data: Measurements | None
-    test: np.ndarray
     stations: tuple[str | None, ...]
     notes: tuple[str, ...] = ()
     unit: str = "dB"
@@ -89,12 +78,6 @@ class Viewed:
         place = site.static_position
         return None if place is None else place + site.origin
 
-    def others(self, station: str | None) -> np.ndarray | None:
-        """World places (3,) [m] of the static end, or (n, 3) of transmitters where both ends moved."""
-        if self.data is None or self.site.static_end is not None:
-            return self.still(station)
-        return np.asarray(self.data.tx[self.rows(station)] + self.site.origin)
-
     def box(self) -> np.ndarray:
         """(2, 3) world corners of where the moving end was [m]."""
         return np.asarray(self.site.moving_box[:, -3:] + self.site.origin)
@@ -117,7 +100,7 @@ class Viewed:
         return np.flatnonzero(self.data.station == number)
 
     def measured(self, station: str | None) -> Measured | None:
-        """Values and errors of a station; None without data."""
+        """Values of a station; None without data."""
         if self.data is None:
             return None
         data, rows = self.data, self.rows(station)
@@ -125,33 +108,14 @@ class Viewed:
         if data.site.kind == "spectrum":
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
             values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
-            label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
+            label = "mean of a measured spectrum"
         else:
             values, side = levels.measured(data, rows)
             # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
-            label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
-        errors = np.full(len(rows), np.nan)
-        tested = np.flatnonzero(np.isin(rows, self.test))
-        tested = tested[evenly(len(tested), MOST_ERRORS)]
-        for start in range(0, len(tested), CHUNK):
-            part = tested[start : start + CHUNK]
-            errors[part] = _errors(self.predictor, data, rows[part], values[part])
-        return Measured(places, values, label, errors, error_label)
-
-
-@torch.no_grad()
-def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
-    batch = data.batch(rows)
-    prediction = predictor.method.predict(batch)
-    if data.site.kind == "spectrum":
-        square = (prediction.mean - batch.target).square().flatten(1).mean(1).double().numpy()
-        return -10 * np.log10(np.maximum(square, LEAST_RATIO))
-    # Without its variance the level is that of the mean, as errors are scored.
-    mean = replace(prediction, variance=None)
-    return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
+            label = f"measured {what} [{self.unit}]"
+        return Measured(places, values, label)
 
 
 def open_viewed(
@@ -173,14 +137,12 @@ def open_viewed(
         ValueError: no checkpoint that can be read.
     """
     notes: list[str] = []
-    data, test = None, np.zeros(0, np.int64)
+    data = None
     try:
         run = open_files([path], dataset)
         predictor, data = run.predictor, run.data
-        if run.foreign is None:
-            test = run.split.folds[0].test
-        else:
-            notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
+        if run.foreign is not None:
+            notes.append(f"measured points are other data: the model was trained on {run.foreign}")
     # Data are gone or changed: a model can be looked at without them.
     except (ValueError, OSError) as error:
         predictor = load(path)
@@ -192,4 +154,4 @@ def open_viewed(
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)
-    return Viewed(str(path), predictor, data, test, stations, tuple(notes), site.level_unit)
+    return Viewed(str(path), predictor, data, stations, tuple(notes), site.level_unit)

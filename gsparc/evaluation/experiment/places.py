@@ -27,7 +27,7 @@ Locate = Callable[[DictConfig, Path], dict[str, Any]]
 def compare_places(
     filled: Sequence[Filled], settings: Mapping[str, Any], cells_dir: Path, locate: Locate
 ) -> pd.DataFrame:
-    """Locate with every kept model that states a variance, and with the field of every set of fingerprints.
+    """Locate with every kept model that states a variance, and by the nearest rows of sets of fingerprints.
 
     A localisation is kept beside its cell. Of several draws and folds the first is located.
 
@@ -45,18 +45,21 @@ def compare_places(
         ValueError: nothing could be located.
     """
     own = {name: value for name, value in settings.items() if name not in ("fingerprints", "splits")}
+    # Cells of several seeds and draws follow one another: of each method the first that works is located.
     jobs: list[tuple[tuple[str, str, str], Path, dict[str, Any]]] = [
         ((one.cell.dataset, one.cell.split, one.cell.method), one.folder, {"ckpt": str(one.checkpoint)})
         for one in filled
         if one.checkpoint.is_file()
     ]
-    # Fingerprints have no cell: their field is fitted by `gsparc locate` itself.
+    # Fingerprints have no cell: `gsparc locate` itself learns from their rows.
     for name, file in settings["fingerprints"].items():
         for split in settings["splits"]:
             chosen = {"dataset": "fingerprints", "dataset.file": file, "dataset.split": split}
-            jobs.append(((name, split, "field"), cells_dir / name / split / "field", chosen))
-    rows: list[dict[str, Any]] = []
+            jobs.append(((name, split, "weighted_knn"), cells_dir / name / split / "weighted_knn", chosen))
+    rows, done = list[dict[str, Any]](), set[tuple[str, str, str]]()
     for names, folder, chosen in jobs:
+        if names in done:
+            continue
         try:
             # store=false: the model belongs to the cell and is not to be changed by what is asked of it.
             facts = _facts(folder, {**chosen, **own, "store": False}, locate)
@@ -64,9 +67,10 @@ def compare_places(
             log.warning("%s is not located: %s", "/".join(names), one_line(error))
             continue
         rows += _rows(names, facts)
+        done.add(names)
     if not rows:
         raise ValueError("task=locate: no cell keeps a model that states a variance")
-    # Cells of several seeds and draws follow one another: the first of each method stays.
+    # Plain methods come beside every model: the first of each stays.
     errors = pd.DataFrame(rows, columns=[*NAMES, *FIGURES]).drop_duplicates(NAMES)
     return errors.sort_values(["dataset", "split", "median_m"], ignore_index=True)
 

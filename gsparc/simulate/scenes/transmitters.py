@@ -54,7 +54,7 @@ class Mast:
     Attributes:
         name: None: numbered.
         position_m: [x, y, z] in the world.
-        position_deg: [latitude, longitude] instead, of scenes on Earth; then `height_m` is needed.
+        position_deg: [latitude, longitude] or [latitude, longitude, z] instead, of scenes on Earth.
         height_m: above what is there, a roof or the ground.
         pattern: one of `PATTERNS`; None: `iso`, or `tr38901` of sectors.
         azimuth_deg, downtilt_deg: see `Antenna`; of the first sector.
@@ -126,7 +126,7 @@ def _position(
     if names[0] == "position_deg":
         if georeference is None:
             raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")
-        values = georeference.from_degrees(values[:1], values[1:2])[0]
+        values = np.append(georeference.from_degrees(values[:1], values[1:2])[0], values[2:])
     if len(values) == 3:
         return values
     if mast.height_m is None or surface is None:

@@ -150,6 +150,8 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
     waves = gsparc.fit(rx=rx, tx=[3.0, 2, 1], csi=csi, frequency_hz=2.4e9, model="complex_gp")
     with pytest.raises(ValueError, match=r"^complex_gp: channels that are not made of image sources [^\n]*$"):
         make.compiled(waves)
+    with pytest.raises(ValueError, match=r"^gp: of spectra only fields of Gaussians have a compiled form"):
+        make.compiled(of_images("gp"))
 
 
 MODELS = {
@@ -158,9 +160,8 @@ MODELS = {
     "powers, a mean of processes": partial(of_powers, 120, "gsparc"),
     "powers, distilled": partial(of_powers, 80, "idw"), "sources": partial(of_sources, 1),
     "sources, many tones": partial(of_sources, 40), "sources, four antennas": partial(of_sources, 7, 4),
-    "image of a process": partial(of_images, "gp"),
     "image of Gaussians": partial(of_images, "gsparc", effects=EffectSettings(residual=False)),
-    "image, distilled": partial(of_images, "idw"), "array": None,
+    "array": None,
 }  # fmt: skip
 
 
@@ -287,7 +288,7 @@ def test_sanitizers_see_nothing(tmp_path, portable, capsys):
     within. `GSPARC_FUZZ_S=3600`: for an hour."""
     library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON", f"-DGSPARC_PORTABLE={portable}")
     asked = driver(library, "-fsanitize=address,undefined", "-DGSPARC_WATCHED")
-    models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4), of_images("gp"))
+    models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4))
     forms = [field_files.an_array(), *(make.compiled(predictor, 64).form for predictor in models)]
     until, seed, slow, refused = time.monotonic() + FUZZ_S, 0, 0, 0
     while seed < 2 or time.monotonic() < until:

@@ -111,7 +111,7 @@ def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
     """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
     none = np.zeros(2)
     rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
-    facts = rate_facts({"expected": [rates]}, np.array([True, False]))
+    facts = rate_facts([rates], np.array([True, False]))
     assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
     assert all(value is None or np.isfinite(value) for value in facts.values())
 
@@ -173,18 +173,15 @@ def test_a_coarse_look_may_be_all_there_is() -> None:
 
 @needs_sionna
 @pytest.mark.slow
-def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
+def test_without_doubt_the_choice_carries_most() -> None:
     draw = drawn()
     true = draw(40, 26)
     known = Band(true, true, torch.zeros(40))
     loop = Adaptation()
-    found = loop.rates(known, 0.03)
-    assert np.array_equal(found.oracle, found.chosen) and found.oracle_bps.mean() > 5e6
-    assert np.allclose(loop.rates(known, 0.03, 1.0, "expected").chosen_bps, found.best_bps)
-    assert (found.best_bps >= found.oracle_bps).all()
-    careful = loop.rates(known, 0.03, 3.0)
-    assert (careful.chosen <= found.oracle).all() and (careful.chosen < found.oracle).mean() > 0.5
-    deaf = loop.rates(known, 1e4)
+    found = loop.rates(known, 0.03, 1.0)
+    assert np.allclose(found.chosen_bps, found.best_bps) and np.allclose(found.regret_bps, 0)
+    assert found.oracle_bps.mean() > 5e6 and (found.best_bps >= found.oracle_bps).all()
+    deaf = loop.rates(known, 1e4, 1.0)
     assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
 
 
@@ -196,7 +193,7 @@ def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
     error = draw(200, 1).expand(200, 26) * 0.2
     band = Band(true, true + error, torch.full((200,), 0.04))
     loop = Adaptation()
-    bold, careful = (loop.rates(band, 0.01, care, "expected") for care in (0.0, 1.0))
+    bold, careful = (loop.rates(band, 0.01, care) for care in (0.0, 1.0))
     assert careful.chosen.mean() < bold.chosen.mean()
     assert bold.chosen_bps.mean() < careful.chosen_bps.mean() < careful.best_bps.mean()
 
@@ -215,7 +212,7 @@ def test_pusch_knows_who_knows_more() -> None:
     band = Band(true, true + error * power, torch.full((16,), 0.36))
     found = pusch.run(band, 3.0, np.arange(128) % 16, 64).groupby("receiver")
     wrong, bits = found.failed.mean(), found.wrong.mean()
-    assert wrong["perfect"] <= wrong["lmmse"] + 0.05 and wrong["lmmse"] <= wrong["ls"] + 0.05
+    assert wrong["perfect"] <= wrong["lmmse"] + 0.05
     assert wrong["predicted"] > wrong["perfect"] + 0.3
     assert bits["perfect"] < bits["predicted"]
 
@@ -229,7 +226,7 @@ def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
     share = 0.2
     guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
     known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
-    pusch = Pusch("qpsk", 4, 30, known, 8, ["perfect", "lmmse", "predicted", "predicted_pilots"])
+    pusch = Pusch("qpsk", 4, 30, known, 8)
     band = Band(true.contiguous(), guess, doubt)
     wrong = pusch.run(band, 3.0, np.arange(256) % 16, 64).groupby("receiver").failed.mean()
     assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05
@@ -252,7 +249,7 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
     answer = knock(COMMANDS["link"].run, "link", [
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
-        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
+        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]",
         "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
         f"hydra.run.dir={tmp_path}",
     ])  # fmt: skip

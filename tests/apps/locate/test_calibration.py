@@ -29,8 +29,9 @@ def snapshots(count, rng, wrong):
 
 def looked(values, cells):
     mean = torch.from_numpy(levels(cells.centre))
-    found = of_levels(torch.from_numpy(values), mean, torch.ones_like(mean))
-    return [Looked(cells, found.of(number)) for number in range(len(values))]
+    return [
+        Looked(cells, of_levels(one[None], mean, torch.ones_like(mean))) for one in torch.from_numpy(values)
+    ]
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """`gsparc compare task=locate`: models that were kept say where their test rows were heard."""
 
+import shutil
+
 import pytest
 import towns
 from campaigns import spectra
@@ -39,6 +41,21 @@ def test_models_with_a_variance_stand_beside_plain_methods(filled, tmp_path, cap
     assert compared(filled[:1], tmp_path, locate=None).equals(found)  # what is kept is not located again
 
 
+def test_of_several_seeds_the_first_alone_is_located(filled, tmp_path):
+    """All draws were located, for hours, and all but the first thrown away."""
+    folders = []
+
+    def located(config, folder):
+        folders.append(folder)
+        return locate(config, folder)
+
+    again = Filled(Cell("own", "random", "gp", None, 1), tmp_path / "second", {})
+    again.folder.mkdir()
+    shutil.copy(filled[0].checkpoint, again.checkpoint)
+    compared([filled[0], again], tmp_path, located, rows=5)
+    assert folders == [filled[0].folder / "locate"]
+
+
 def test_without_a_variance_there_is_nothing_to_compare(filled, tmp_path):
     with pytest.raises(ValueError, match="task=locate: no cell keeps a model that states a variance"):
         compared(filled[1:], tmp_path)
@@ -57,6 +74,6 @@ def test_fingerprints_are_split_as_is_said(tmp_path):
     chosen = {"fingerprints": {"lib": str(file)}, "splits": ["random", "blocks"]}
     found = compared([], tmp_path, located, **chosen)
     assert found[["dataset", "split", "method"]].to_numpy().tolist() == [
-        ["lib", "blocks", "field"], ["lib", "random", "field"],
+        ["lib", "blocks", "weighted_knn"], ["lib", "random", "weighted_knn"],
     ]  # fmt: skip
     assert splits == [("fingerprints", split, str(file)) for split in ("random", "blocks")]

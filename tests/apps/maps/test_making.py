@@ -15,7 +15,6 @@ import gsparc
 from gsparc.apps.maps.field_map import (
     ARRAYS,
     REFUSED,
-    FieldMap,
     best_server,
     loads,
     overlapping,
@@ -54,7 +53,7 @@ def test_cells_hold_what_the_model_predicts(predictor):
     assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
 
 
-def test_a_unit_of_maps_changed_their_names_alone(tmp_path):
+def test_a_unit_of_maps_changed_their_names_alone():
     """`unit=dBm` of levels in dBW wrote dBm beside the same numbers and the threshold of the others."""
     stored = gsparc.load(town_model())
     predictor = Predictor(stored.method, replace(stored.site, level_unit="dBW"), extra=stored.extra)
@@ -66,8 +65,7 @@ def test_a_unit_of_maps_changed_their_names_alone(tmp_path):
     for name in ("expected_error_db", "outage", "sinr_db", "server_chance", "best_server"):
         np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
     assert "[dBm]" in next(iter(layers(other))).legend.label
-    other.save(tmp_path / "map.npz")
-    assert FieldMap.read(tmp_path / "map.npz").unit == "dBm" and other.figures()["map/unit"] == "dBm"
+    assert other.figures()["map/unit"] == "dBm"
     with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
         map_of(predictor, unit="W")
 
@@ -194,17 +192,14 @@ def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
     assert _usual(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
 
 
-def test_saved_and_read_back(predictor, tmp_path):
+def test_saved_whole(predictor, tmp_path):
     made = map_of(predictor, [0, 0, 80, 60], step_m=8.0)
     made.save(tmp_path / "map.npz")
-    found = FieldMap.read(tmp_path / "map.npz")
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
-    assert found.stations == ("west", "east") and found.grid.step == pytest.approx(8.0)
+    with np.load(tmp_path / "map.npz") as found:
+        for name in ARRAYS:
+            np.testing.assert_array_equal(found[name], getattr(made, name))
+        assert found["stations"].tolist() == ["west", "east"] and str(found["unit"]) == made.unit
     assert made.figures()["map/cells"] == made.grid.inside.sum()
-    (tmp_path / "other.npz").write_bytes(b"no archive")
-    with pytest.raises(DataError, match="no map that can be read"):
-        FieldMap.read(tmp_path / "other.npz")
 
 
 def test_spectra_have_no_power(predictor, monkeypatch):
@@ -226,17 +221,18 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
     every, count = refined(ask, inside, 1, 0.1)
     few, asked = refined(ask, inside, 4, 0.1)
     assert count == inside.sum() and asked < 0.2 * count
-    assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.15
+    assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.1
+    exact, asked = refined(ask, inside, 4, 1e-6)
+    assert asked > 0.9 * count and np.nanmax(np.abs(exact - every)) < 1e-4
 
 
-def test_channels_have_a_power_and_paths(tmp_path):
+def test_channels_have_a_power(tmp_path):
     data = load_own(channels(tmp_path / "own.npz"))
     method, rows = method_class("image_source_gp")(budget_s=1.0), np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path))
     found = map_of(Predictor(method, data.site), step_m=0.5, height_m=1.2)
     assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
-    assert (found.expected_error_db > 0).all() and set(found.extra) == {"delay_spread_ns", "direction_deg"}
-    assert (found.extra["delay_spread_ns"] >= 0).all() and (found.extra["delay_spread_ns"] < 100).all()
+    assert (found.expected_error_db > 0).all() and not found.extra
     near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
     place = found.grid.places(np.array([near]))[0, :2]
     assert np.linalg.norm(place - [1, 1]) < 1.0

@@ -28,14 +28,13 @@ def together(tmp_path_factory):
     return method, data, folder / "model.ckpt"
 
 
-@pytest.mark.parametrize("goal", ["coverage", "worst"])
-def test_the_best_place_is_far_from_those_that_serve(together, goal):
+def test_the_best_place_is_far_from_those_that_serve(together):
     predictor = gsparc.load(together[2])
-    found = place_next(predictor, goal=goal, threshold_db=-75.0, count=60, error=NewStation(3.0, 1.0, 4))
+    found = place_next(predictor, threshold_db=-75.0, count=60, error=NewStation(3.0, 1.0, 4))
     apart = np.linalg.norm(found.places[0, :2] - MASTS[:, :2], axis=1)
-    assert apart.min() > 20 and found.goal[0] > found.before
-    assert (found.low <= found.goal + 0.05).all() and (found.goal <= found.high + 0.05).all()
-    assert (np.diff(found.goal) <= 1e-12).all() and (found.places[:, 2] == 8).all()
+    assert apart.min() > 20 and found.coverage[0] > found.before
+    assert (found.low <= found.coverage + 0.05).all() and (found.coverage <= found.high + 0.05).all()
+    assert (np.diff(found.coverage) <= 1e-12).all() and (found.places[:, 2] == 8).all()
 
 
 def test_two_stations_leave_none_out(together):
@@ -47,7 +46,6 @@ def test_two_stations_leave_none_out(together):
 
 
 @pytest.mark.parametrize("said, how", [
-    ("one of coverage, worst", {"goal": "best"}),
     ("at least 1", {"count": 0}),
     ("no such file", {"sites": "missing.geojson"}),
     ("stations=together", {}),

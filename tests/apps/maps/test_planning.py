@@ -88,7 +88,7 @@ def test_a_walk_is_not_longer_than_it_must_be():
     tour = Tour(np.zeros(2), None)
     for place in places:
         tour.add(place)
-    assert Tour.length_of(places[tour.order()], np.zeros(2)) == pytest.approx(11)
+    assert Tour.length_of(places[tour.number], np.zeros(2)) == pytest.approx(11)
 
 
 @pytest.mark.parametrize("how, said", [

@@ -4,9 +4,8 @@ import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.building import Building, build
+from gsparc.apps.view.building import build
 from gsparc.apps.view.scene import EXTENT, Frame
-from gsparc.data.walls import SceneWalls
 
 
 def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
@@ -31,15 +30,12 @@ def test_values_that_are_not_known_are_grey():
     assert Legend.over("nothing", np.full(3, np.nan)).high > Legend.over("nothing", np.full(3, np.nan)).low
 
 
-def test_a_floor_plan_and_the_grid_lie_beneath_the_plane_and_the_walls(power_view):
+def test_a_floor_plan_and_the_grid_lie_beneath_the_plane(power_view):
     """The plan lay at the height of the plane: of each other half was hidden."""
     viewed, plan = power_view.viewed, FloorPlan(np.zeros((60, 80, 3), np.uint8), 1 + 0j, 60j)
     low = viewed.heights()[0]
-    scene = build(viewed, Building(plan), "west", None)
+    scene = build(viewed, plan, "west", None)
     assert scene.ground < scene.part("floor plan").corner[2] < low <= power_view.grid.height
-    wall = np.array([[0.0, 0, -9], [9, 0, -9], [9, 0, 3]])
-    deep = build(viewed, Building(plan, SceneWalls((wall,), np.zeros((0, 2, 3)))), "west", None)
-    assert deep.part("floor plan").corner[2] < -9 < low
 
 
 def test_heights_of_a_plane_are_whole_centimetres(power_view):

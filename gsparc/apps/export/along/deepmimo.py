@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.apps.export.along.taps import located_paths
 from gsparc.data.schema import LIGHT
 from gsparc.prediction.predictor import Predictor
 
@@ -27,9 +26,11 @@ def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, f
         ValueError: another model.
     """
     site = predictor.site
-    paths = located_paths(predictor, place) if site.static_position is not None else None
-    if paths is None or paths.direction is None:
-        raise ValueError("to=deepmimo: channels made of paths, of a static end at a known place, are needed")
+    if site.static_position is None:
+        raise ValueError("to=deepmimo: the place of the static end is needed")
+    paths = predictor.paths(**{site.moving_end: place})
+    if paths.direction is None:
+        raise ValueError("to=deepmimo: paths with directions are needed")
     still = np.asarray(site.static_position, np.float64) + site.origin
     power = np.square(np.abs(paths.gain[:, 0].astype(np.complex128)))
     order = np.argsort(-power, axis=1)[:, :PATHS]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,12 @@ import numpy as np
 
 from gsparc.data.raw import Raw, write_raw
 from gsparc.data.schema import LIGHT
-from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
 MOST = 50_000  # instants
 CHUNK = 64  # places that the model answers at once
-OCCUPIED = 0.8  # of the sampling rate: the band over which taps are fitted to paths
-FITTED = 512  # tones in it
-SAME = 1e-3  # of the channels' root mean square: paths that are all of them
+FITTED = 512  # channels that tell where most power arrives
 RIDGE = 1e-4  # of a tap's energy over the tones: what the band does not hold stays small
 
 
@@ -72,7 +69,6 @@ class Line:
         rate_hz, carrier_hz: of the samples, and the middle of the band [Hz].
         residual: mean square that taps leave of the model's channels over the band, of these.
         worst: the same of the worst instant.
-        paths: that the model's channels consist of, with `doppler_hz` (T, A, N); None where it has none.
     """
 
     time_s: np.ndarray
@@ -82,19 +78,12 @@ class Line:
     carrier_hz: float
     residual: float
     worst: float
-    paths: Paths | None = None
 
     def doppler_hz(self) -> np.ndarray:
         """Mean Doppler shift (A, L) float64 [Hz] of each tap: the phase it gains from instant to instant."""
         # The mean of products weighs each step by its power: a fade's phase is noise.
         turned = (self.gain[1:] * self.gain[:-1].conj()).sum(0, dtype=np.complex128)
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
-
-    def path_doppler_hz(self) -> np.ndarray:
-        """Doppler shifts (T, A, N) [Hz] of the paths: how fast their delays shrink."""
-        assert self.paths is not None
-        # Doppler is -f d(delay)/dt: a path that shortens has a positive shift.
-        return -self.carrier_hz * np.gradient(self.paths.delay_s, self.time_s, axis=0)
 
 
 def write_impulses(
@@ -117,9 +106,6 @@ def write_impulses(
     delay_s = (line.first + np.arange(line.gain.shape[2])) / line.rate_hz
     known = (line.time_s, way.at(line.time_s), delay_s, line.doppler_hz())
     arrays = dict(zip(units, known, strict=True)) | {"gain": line.gain}
-    if line.paths is not None:
-        arrays |= {"path_gain": line.paths.gain, "path_delay_s": line.paths.delay_s}
-        arrays["path_doppler_hz"] = line.path_doppler_hz()
     about = {"rate_hz": line.rate_hz, "carrier_hz": line.carrier_hz, "residual": line.residual}
     write_raw(file, Raw(arrays, about, units))
     # 1e-30 is -300 dB: no residual at all has no decibels.
@@ -135,8 +121,7 @@ def fitted(
 ) -> Line:
     """Taps of a model's channels along a trajectory, by least squares over the band.
 
-    Over the measured tones, or, where the model's channels are a sum of paths, over `OCCUPIED` of the rate,
-    whatever was measured. The taps stand side by side, where most power arrives.
+    Over the measured tones. The taps stand side by side, where most power arrives.
 
     Args:
         predictor, way: of channels with one end that stands still, and of the other end.
@@ -156,31 +141,17 @@ def fitted(
     # The band where all tones are in use; with gaps it is too narrow, which is refused below.
     rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
     time_s = way.instants(LIGHT / carrier)
-    places, parts = way.at(time_s), list[Paths]()
+    places = way.at(time_s)
 
     def ask(place: np.ndarray) -> np.ndarray:
-        if early is not None:
-            one = located_paths(predictor, place, antennas)
-            assert one is not None
-            parts.append(one)
-            return one.channel(tones)
         tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))
         return predictor.csi(tx, rx)[:, :antennas]
 
-    early: float | None = None
-    look = places[:: max(len(places) // CHUNK, 1)][:CHUNK]
-    known, rays = ask(look), located_paths(predictor, look, antennas)
-    if rays is not None and np.linalg.norm(rays.channel(tones) - known) < SAME * np.linalg.norm(known):
-        tones = carrier + rate_hz * OCCUPIED * np.linspace(-0.5, 0.5, FITTED)
-        # Delays count from `taps` samples before the first path: all are then positive.
-        early = np.floor(rays.delay_s.min() * rate_hz) - taps  # beyond what tones can tell apart
-        known = ask(look) * np.exp(2j * np.pi * (tones - carrier) / rate_hz * early)
-        parts.clear()
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
     # No more taps than equations, of which each tone is one.
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
-    first = int(early or 0) + _first(known, turns, taps)
+    first = _first(ask(places[:: max(len(places) // CHUNK, 1)][:CHUNK]), turns, taps)
     columns, solve = _atoms(turns, first, taps)
     gains, left, power = [], [], []
     for start in range(0, len(places), CHUNK):
@@ -192,21 +163,8 @@ def fitted(
     if not total.all():
         at = places[int(np.argmin(total))].round(2).tolist()
         raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
-    paths = None
-    if parts:
-        gain, delay = (np.concatenate([getattr(one, name) for one in parts]) for name in ("gain", "delay_s"))
-        paths = Paths(gain, delay, parts[0].reference_hz)
     residual = float(error.sum() / total.sum()), float((error / total).max())
-    return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual, paths)
-
-
-def located_paths(predictor: Predictor, place: np.ndarray, antennas: int = 1) -> Paths | None:
-    """Return paths of the first antennas at places (B, 3) [m, world]; None of a model without paths."""
-    try:
-        paths = predictor.paths(**{predictor.site.moving_end: place})
-    except ValueError:
-        return None
-    return replace(paths, gain=paths.gain[:, :antennas], delay_s=paths.delay_s[:, :antennas])
+    return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
 
 
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:

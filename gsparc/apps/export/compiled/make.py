@@ -11,7 +11,7 @@ import torch
 from gsparc.apps.export.compiled.blob import Form
 from gsparc.apps.export.compiled.channels import sources_form
 from gsparc.apps.export.compiled.powers import powers_form
-from gsparc.apps.export.compiled.spectra import array_form, process_form, view_form
+from gsparc.apps.export.compiled.spectra import array_form, view_form
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
@@ -31,8 +31,7 @@ from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
-ANSWERED = {"spectrum": 400, "csi": 1500, "rssi": 3000}  # places that distilled forms are made from
-KEPT = 96  # components of spectra: what a query reads grows with them
+ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
 
 
 @dataclass(frozen=True)
@@ -120,9 +119,7 @@ def exact_form(method: Method, site: Site) -> Form | None:
     if isinstance(method, LearnedField):
         return _rendered(method, site)
     if isinstance(method, GaussianProcess):
-        if method.powers is not None:
-            return powers_form(method.powers, site.target_scale)
-        return process_form(method) if site.kind == "spectrum" else None
+        return None if method.powers is None else powers_form(method.powers, site.target_scale)
     if isinstance(method, ImageSourceGP):
         cluttered = any(len(member.scene.clutter) for member in method.members)
         return None if cluttered else sources_form(method, site, method.query)
@@ -141,10 +138,11 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
 
 
 def distilled_form(predictor: Predictor, seed: int) -> Form:
-    """Return a form near a model: its array's part alone, or a process given its answers at random places.
+    """Return a form near a model: its array's part alone, or sources or a process of powers given its answers
+    at random places.
 
     Raises:
-        ValueError: channels that are not made of sources.
+        ValueError: channels that are not made of sources, or spectra that are not rendered.
     """
     method, site = predictor.method, predictor.site
     if isinstance(method, ImageProcess) and method._average is not None:
@@ -154,13 +152,17 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
             # A copy: the model of the caller keeps the process that it is averaged with.
             alone._average = None
             return replace(own_form, predictor=Predictor(alone, site))
+    if site.kind == "spectrum":
+        raise ValueError(
+            f"{method.name}: of spectra only fields of Gaussians have a compiled form (model=gsparc)"
+        )
     sources = _sources_of(method) if site.kind == "csi" else None
     data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
     if sources is not None:
         return _sources_given(sources, data)
     every = np.arange(len(data))
     # All rows are learned from: a model's answers have no noise that validation would guard against.
-    process = GaussianProcess(KEPT)
+    process = GaussianProcess()
     process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
     form = exact_form(process, site)
     assert form is not None

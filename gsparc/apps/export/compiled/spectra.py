@@ -1,16 +1,13 @@
-"""Spectra as compiled forms: lag tables of an array, images of Gaussians, images of a process."""
+"""Spectra as compiled forms: lag tables of an array, images of Gaussians."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from gsparc.apps.export.compiled.blob import Form
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.field.model import GaussianModel
-from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.processes.features import parts_of
-from gsparc.processes.posterior import Exact
 
 ROWS, COLUMNS = 4, 4  # pixels of a block
 ACTIVATIONS = {"linear": 0, "sigmoid": 1, "softplus": 2}
@@ -60,34 +57,6 @@ def view_form(frozen: FrozenView) -> Form | None:
         "weights": emission.weight2.detach()[:, :, 0].T.float().numpy(),
         "offset": emission.bias2.detach()[:, 0].numpy(), "means": means if needed else means[:0],
         "starts": starts, "ranks": ranks, "blocks": blocks,
-    }  # fmt: skip
-    return Form(2, [float(number) for number in numbers], arrays)
-
-
-def process_form(process: GaussianProcess) -> Form | None:
-    """Return the form of a process on whole spectra given its rows: images of all its components."""
-    scores = process.scores
-    if not isinstance(scores, Exact) or scores.prior.trend is not None:
-        return None
-    places, weights = scores.rows.numpy(), scores.weights.double().numpy()
-    images = torch.cat([process.mean[None], process.axes]).unflatten(1, process.shape).numpy()
-    count, height, width = images.shape
-    tall, wide = -(-height // ROWS), -(-width // COLUMNS)
-    # Filled up to whole blocks with zeros, which the library computes and does not write.
-    whole = np.zeros((count, tall * ROWS, wide * COLUMNS), np.float32)
-    whole[:, :height, :width] = images
-    blocks = whole.reshape(count, tall, ROWS, wide, COLUMNS).transpose(1, 3, 0, 2, 4)
-    tiles = tall * wide
-    numbers = [
-        places.shape[1], len(places), count - 1, 0.0, 1.0, 1.0, scores.prior.kernel.lengths[0],  # type: ignore[union-attr]
-        count, height, width, ACTIVATIONS["linear"], 0, 0, 0, 1.0, 0.0, 1.0,
-    ]  # fmt: skip
-    arrays = {
-        # Component 0 is the mean image, with weight 1 at every place.
-        "at": places, "whitening": weights, "weights": np.eye(count, dtype=np.float32)[1:],
-        "offset": np.eye(1, count, dtype=np.float32)[0], "blocks": blocks.reshape(-1, ROWS * COLUMNS),
-        "starts": np.arange(tiles + 1, dtype=np.int64) * count,
-        "ranks": np.tile(np.arange(count, dtype=np.int32), tiles),
     }  # fmt: skip
     return Form(2, [float(number) for number in numbers], arrays)
 

@@ -1,4 +1,4 @@
-"""Parts of a scene as nodes of `viser`, in drawn units."""
+"""A scene as nodes of `viser`, its floor and where it is looked at from, in drawn units."""
 
 from __future__ import annotations
 
@@ -6,69 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.apps.view.scene import EXTENT, Scene
 
-THICKNESS = 1.5  # of lines [pixels]
-STATION = (40, 40, 40)
 ABOVE = (0.15, -0.95, 0.8)  # where a camera first stands, in widths of the site
 ASIDE = 0.15  # how far east of the site it looks, where a panel covers what lies there
 
 
-def draw(api: Any, frame: Frame, part: Part) -> Any:
-    """Add a part under its name, in place of the one that had it; returns viser's handle."""
-    name = path_of(part.name)
-    if isinstance(part, Points):
-        return api.add_point_cloud(
-            name, frame.drawn(part.places), part.colours, point_size=part.size * frame.scale,
-            point_shape="circle", precision="float32", point_shading="flat",
-        )  # fmt: skip
-    if isinstance(part, Lines):
-        places, colours = frame.drawn(part.segments), np.repeat(part.colours[:, None], 2, axis=1)
-        return api.add_line_segments(name, places, colours, thickness=THICKNESS, thickness_units="screen")
-    if isinstance(part, Splats):
-        return api.add_gaussian_splats(
-            name, frame.drawn(part.means), np.float32(part.covariances * frame.scale**2), part.colours,
-            part.opacities.astype(np.float32)[:, None],
-        )  # fmt: skip
-    if isinstance(part, Faces):
-        return api.add_mesh_simple(
-            name, frame.drawn(part.vertices), part.triangles, color=part.colour, opacity=part.opacity,
-            side="double", flat_shading=True, cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
-    if isinstance(part, Sheet):
-        return _sheet(api, frame, part)
-    assert isinstance(part, Mark)
-    place = frame.drawn(part.place)
-    ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=place)
-    if part.text:
-        api.add_label(f"{name}/name", part.text, position=(0.0, 0.0, 0.02 * EXTENT), anchor="bottom-center")
-    return ball
-
-
 def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything that is not hidden at first, in place of the nodes `before`; returns the nodes by name."""
+    """Everything, in place of the nodes `before`; returns the nodes by name."""
     for node in before.values():
         node.remove()
-    return {part.name: draw(api, scene.frame, part) for part in scene.parts if part.name not in scene.hidden}
-
-
-def path_of(name: str) -> str:
-    """Return the path of a node, its name without what separates nodes."""
-    return "/" + name.replace("/", " ")
-
-
-def _sheet(api: Any, frame: Frame, part: Sheet) -> Any:
-    """A picture's columns run along x of its node, its rows along y."""
-    wide, tall = np.linalg.norm(part.right), np.linalg.norm(part.down)
-    x, y = part.right / wide, part.down / tall
-    turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
-    middle = part.corner + (part.right + part.down) / 2
-    return api.add_image(
-        path_of(part.name), part.image, float(wide * frame.scale), float(tall * frame.scale),
-        cast_shadow=False, receive_shadow=False, wxyz=turn, position=frame.drawn(middle),
-    )  # fmt: skip
+    return {part.name: part.draw(api, scene.frame) for part in scene.parts}
 
 
 def floor(api: Any, scene: Scene) -> float:

@@ -12,13 +12,13 @@ import numpy as np
 import viser
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.answer import Answer, ask
+from gsparc.apps.view.answer import ask
 from gsparc.apps.view.building import PATHS, SPHERE, rays_of
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import sheet
-from gsparc.apps.view.reasons import ENDS, Usual, headline, legend_html
+from gsparc.apps.view.reasons import ENDS, headline, legend_html
 from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
-from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.server.draw import draw_scene, first_view, floor
 from gsparc.apps.view.site_view import SiteView, walk
 
 STEPS = 24  # places of the walk, of all stations together
@@ -75,9 +75,9 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
                 around = answer.ends["rx"] + sphere.offsets
                 parts.append(Points(SPHERE, around, sphere.colours(answer.spectrum), sphere.size))
-            usual = view.station(name).about.usual
-            parts.append(_upright(answer, view, usual, scene.frame.middle, extent))
-            nodes |= {part.name: draw(api, scene.frame, part) for part in parts}
+            image = panel_image(answer, viewed.site)
+            parts += [] if image is None else [_upright(image, scene.frame.middle, extent)]
+            nodes |= {part.name: part.draw(api, scene.frame) for part in parts}
             recorder.insert_sleep(PAUSE_S)
             count += 1
     which = ""
@@ -97,21 +97,20 @@ def _still(
     one = view.station(name)
     scene = one.scene
     nodes = draw_scene(api, scene, before)
-    legends = [legend for part, legend in scene.legends.items() if part not in scene.hidden]
+    legends = list(scene.legends.values())
     if view.grid is not None:
         plane = view.plane(name, view.grid)
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
         level = sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
-        nodes["plane"] = draw(api, scene.frame, level)
+        nodes["plane"] = level.draw(api, scene.frame)
     if len(view.viewed.stations) > 1:
         legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]
     return nodes, legends
 
 
-def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:
+def _upright(image: np.ndarray, middle: np.ndarray, extent: float) -> Sheet:
     """The panel of an answer, standing behind the site."""
-    image = panel_image(answer, view.viewed.site, known, view.unit)
     wide = 1.05 * extent
     tall = wide * image.shape[0] / image.shape[1]
     corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.18 * extent + tall])

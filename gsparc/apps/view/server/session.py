@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -14,28 +14,18 @@ from numpy.typing import ArrayLike
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer, ask
-from gsparc.apps.view.building import (
-    ERRORS,
-    GAUSSIANS,
-    PATHS,
-    RAYS,
-    SPHERE,
-    SPLATS,
-    VALUES,
-    rays_of,
-)
+from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, rays_of
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.panel import panel_image
-from gsparc.apps.view.plane import Plane, beyond_distance, refining, sheet, weakest
+from gsparc.apps.view.plane import Plane, refining, sheet, weakest
 from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
 from gsparc.apps.view.scene import EXTENT, Points
-from gsparc.apps.view.server.draw import draw, draw_scene, first_view, floor
+from gsparc.apps.view.server.draw import draw_scene, first_view, floor
 from gsparc.apps.view.site_view import SiteView
 
-PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
-CLOUD = {"points": GAUSSIANS, "ellipsoids": SPLATS}
+SHOWN = {VALUES: "measured points", GAUSSIANS: "Gaussians"}  # that can be hidden
 
 
 class Session:
@@ -54,9 +44,6 @@ class Session:
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
-        self.map_layers: dict[str, tuple[Grid, np.ndarray, Legend]] = {}  # as they are chosen
-        for grid, one in view.layers:
-            self.map_layers[f"map: {one.name.replace('_', ' ')}"] = grid, one.values, one.legend
         self._draw_still()
         first_view(client.camera)
         self._panel()
@@ -79,7 +66,7 @@ class Session:
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
             around = self.scene.frame.middle + self.sphere.offsets
             dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
-            self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
+            self.nodes[SPHERE] = dots.draw(api, self.scene.frame)
 
     def _add_gizmos(self) -> None:
         for end, place in self.places.items():
@@ -123,38 +110,23 @@ class Session:
 
     def _layers_panel(self, gui: Any) -> None:
         with gui.add_folder("Shown"):
-            has = {name: self.scene.part(name) is not None for name in (VALUES, ERRORS, GAUSSIANS)}
-            if has[VALUES]:
-                points = {"values": VALUES, **({"errors": ERRORS} if has[ERRORS] else {})}
-                chosen = gui.add_dropdown("measured points", (*points, NOTHING), initial_value="values")
-                self._on(chosen, partial(self._show_only, points))
-            if has[GAUSSIANS]:
-                self._on(gui.add_dropdown("Gaussians", (*CLOUD, NOTHING)), partial(self._show_only, CLOUD))
-            self.chosen: Any = None
-            if self.view.grid is not None or self.map_layers:
-                known = self.one.about.usual
-                far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
-                names = (*((PREDICTED, *far) if self.view.grid is not None else ()), *self.map_layers)
-                self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
-                self._on(self.chosen, lambda value: self.want_plane())
-                self.progress = gui.add_markdown("")
+            for name in filter(self.nodes.__contains__, SHOWN):
+                self._on(gui.add_checkbox(SHOWN[name], True), partial(self._show_part, name))
             if self.view.grid is not None:
+                self.laid = gui.add_checkbox("plane of predicted power", True)
+                self._on(self.laid, lambda value: self.want_plane())
+                self.progress = gui.add_markdown("")
                 low, high = self.view.viewed.heights()
                 first = round(self.view.grid.height, 2)
                 self.height = gui.add_slider("height [m]", min(low, first), max(high, first), 0.01, first)
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
-        notes = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        note = "both ends moved: measured points are where the receiver was, wherever its transmitter"
         if self.site.static_end is not None:
-            notes.append(
-                f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
-            )
-        else:
-            notes.append(
-                "both ends moved: measured points are where the receiver was, wherever its transmitter"
-            )
-        return notes
+            still = ENDS[self.site.static_end]
+            note = f"the {still} stood still when measured: the model knows it there alone"
+        return [*self.scene.notes, f"grid: {self.cell:g} m", note]
 
     def _on(self, handle: Any, act: Any) -> None:
         """Do something with a value that the client changed, not with one that we set."""
@@ -197,18 +169,9 @@ class Session:
                 place = weak_place
         self._move(moving, place)
 
-    def _show_only(self, parts: Mapping[str, str], choice: str) -> None:
-        """Of parts, by the words to choose them by, show the one that was chosen alone."""
-        for word, name in parts.items():
-            self._set_visible(name, word == choice)
+    def _show_part(self, name: str, visible: bool) -> None:
+        self.nodes[name].visible = visible
         self._legends()
-
-    def _set_visible(self, name: str, visible: bool) -> None:
-        """Show or hide a part; what is hidden at first is sent when it is first shown."""
-        if name in self.nodes:
-            self.nodes[name].visible = visible
-        elif visible and (part := self.scene.part(name)) is not None:
-            self.nodes[name] = draw(self.client.scene, self.scene.frame, part)
 
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
@@ -232,13 +195,12 @@ class Session:
 
     def _show_station(self, name: str) -> Iterator[None]:
         self.station, self.one = name, self.view.station(name)
-        choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
-        visibility = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        visibility = {name: self.nodes[name].visible for name in SHOWN if name in self.nodes}
         # All at once, or a client sees half of two stations.
         with self.client.atomic():
             self._draw_still()
-            for name, visible in visibility.items():
-                self._set_visible(name, visible)
+            for name in visibility.keys() & self.nodes.keys():
+                self.nodes[name].visible = visibility[name]
         self.title.content = f"**{self.scene.title}**"
         self._legends()
         self.want_answer()
@@ -258,7 +220,7 @@ class Session:
         yield
 
     def _show(self, answer: Answer) -> None:
-        why = reasons(answer, self.view.viewed.moving[-1], self.one.about)
+        why = reasons(answer, self.view.viewed.moving[-1], self.one.tree)
         rays, first = rays_of(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
         with self.client.atomic():
             self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
@@ -268,56 +230,43 @@ class Session:
                 self.nodes[SPHERE].position = self.scene.frame.drawn(answer.ends["rx"])
                 self.nodes[SPHERE].colors = self.sphere.colours(answer.spectrum)
             for part in rays:
-                self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
+                self.nodes[part.name] = part.draw(self.client.scene, self.scene.frame)
         if rays and first:
             self._legends()
 
     def _panel_of(self, answer: Answer) -> Iterator[None]:
         """The picture of an answer, which takes longer than the answer: a drag does not wait for it."""
-        image = panel_image(answer, self.site, self.one.about.usual, self.view.unit)
-        if self.picture is None:
-            self.picture = self.client.gui.add_image(
-                image, jpeg_quality=85, order=self.answer_text.order + 0.1
-            )
-        else:
+        image = panel_image(answer, self.site)
+        if image is not None and self.picture is None:
+            order = self.answer_text.order + 0.1
+            self.picture = self.client.gui.add_image(image, jpeg_quality=85, order=order)
+        elif image is not None:
             self.picture.image = image
         yield
 
     def _planes(self) -> Iterator[None]:
-        name = NOTHING if self.chosen is None else self.chosen.value
         self.power = None
-        if name in self.map_layers:
-            grid, *_ = self.map_layers[name]
-            self._lay(*self.map_layers[name])
-            self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
-        elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
-            grid = replace(self.view.grid, height=float(self.height.value))
-            yield from self._predicted_plane(grid, name == BEYOND)
+        if self.view.grid is not None and self.laid.value:
+            yield from self._predicted_plane(replace(self.view.grid, height=float(self.height.value)))
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
         yield
 
-    def _predicted_plane(self, grid: Grid, beyond: bool) -> Iterator[None]:
+    def _predicted_plane(self, grid: Grid) -> Iterator[None]:
         predictor = self.view.viewed.predictor_of(self.station)
-        other = self.places["tx"] if self.site.static_end is None else None
-        known, there = self.one.about.usual, self._still()
-        legend, begin = None if beyond else self.one.power, time.perf_counter()
+        other = self.places["tx"].tolist() if self.site.static_end is None else None
+        legend, begin = self.one.power, time.perf_counter()
         self.visited.clear()
-        for plane in refining(predictor, grid, None if other is None else other.tolist()):
+        for plane in refining(predictor, grid, other):
             if plane is None:
                 yield
                 continue
-            if beyond and known is not None and there is not None:
-                plane = beyond_distance(plane, known, there)
-                # Three deviations of measured levels at both ends, of a diverging map about 0.
-                most = max(3 * known.spread_db, 1.0)
-                label = "power more than distance alone explains [dB]"
-                legend = legend or Legend(label, -most, most, "PuOr")
             first = self.power is None
-            legend = legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db)
+            legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
             self.plane, self.power = plane, legend
-            self._lay(grid, plane.level_db, legend)
+            part = sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2)
+            self.nodes[PLANE] = part.draw(self.client.scene, self.scene.frame)
             if first:
                 self._legends()
             suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
@@ -327,19 +276,9 @@ class Session:
             )
             yield
 
-    def _still(self) -> np.ndarray | None:
-        """World place (3,) [m] of the other end than the plane's."""
-        return self.places["tx"] if self.site.static_end is None else self.view.viewed.still(self.station)
-
-    def _lay(self, grid: Grid, values: np.ndarray, legend: Legend) -> None:
-        part = sheet(PLANE, grid, values, legend, self.one.dot / 2)
-        self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
-
     def _legends(self) -> None:
         legends = self.scene.legends
         entries = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
         entries += [PATHS] if RAYS in self.nodes else []
         entries += [self.power] if PLANE in self.nodes and self.power is not None else []
-        name = NOTHING if self.chosen is None else self.chosen.value
-        entries += [self.map_layers[name][2]] if name in self.map_layers else []
         self.legend.content = legend_html(entries, self.scene.parts)

@@ -1,4 +1,4 @@
-"""Taps of known channels, their Doppler, and the file that a link simulator plays."""
+"""Taps of known channels, their Doppler, and the file of them."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 import gsparc
 from gsparc.apps.export.along.taps import Trajectory, fitted
 from gsparc.commands import export
-from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.data.raw import read_raw
 from gsparc.data.schema import LIGHT
 from gsparc.models import checkpoint
 from gsparc.prediction.channels import Paths
@@ -64,7 +64,7 @@ TONES = CARRIER + 240e3 * (np.arange(128) - 63.5)
 def test_taps_sum_to_the_channel_at_any_time(with_paths):
     model, way = Rays(TONES, with_paths), drive()
     line = fitted(model, way, 48, 38.4e6, 3)
-    assert line.residual < 1e-3 and line.worst < 1e-2 and (line.paths is not None) == with_paths
+    assert line.residual < 1e-3 and line.worst < 1e-2
     between = np.linspace(0.003, 0.497, 37)  # not instants
     tones = TONES[20:-20]
     delay = (line.first + np.arange(48)) / line.rate_hz
@@ -79,11 +79,9 @@ def test_doppler_is_that_of_the_motion():
     line = fitted(model, way, 16, 38.4e6)
     middle = way.at(np.array([0.25]))[0]
     towards = (model.sources - middle) / np.linalg.norm(model.sources - middle, axis=1)[:, None]
-    expected = CARRIER / LIGHT * 10 * towards[:, 0]
-    found = line.path_doppler_hz()[len(line.time_s) // 2, 0]
-    np.testing.assert_allclose(found, expected, rtol=0.01)
+    expected = CARRIER / LIGHT * 10 * towards[0, 0]
     loudest = np.abs(line.gain[:, 0]).mean(0).argmax()
-    assert line.doppler_hz()[0, loudest] == pytest.approx(expected[0], rel=0.15)
+    assert line.doppler_hz()[0, loudest] == pytest.approx(expected, rel=0.15)
 
 
 def test_residual_is_stated_and_falls_with_taps():
@@ -126,59 +124,23 @@ def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch)
     assert not (tmp_path / "other").exists()
 
 
-def played(file, line, taps, end="rx_position"):
-    """Sionna's channel model of a line of taps."""
-    from gsparc.apps.export.along.link import TrajectoryChannel
-
-    delay = (line.first + np.arange(taps)) / line.rate_hz
-    arrays = {"time_s": line.time_s, "gain": line.gain, "delay_s": delay}
-    write_raw(file, Raw({**arrays, end: drive().at(line.time_s)}))
-    return TrajectoryChannel(file, seed=3)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("receives", [False, True])
-def test_sionna_hears_the_models_channel(tmp_path, receives):
-    """Through Sionna's own way from a channel model to a grid of tones and symbols."""
-    pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
-    from sionna.phy.channel import cir_to_ofdm_channel
-
-    ray, way = Rays(TONES), drive()
-    end = "tx_position" if receives else "rx_position"
-    model = played(tmp_path / "cir.npz", fitted(ray, way, 64, antennas=2), 64, end)
-    gain, tau = model(5, 14, 28e3)
-    assert gain.shape == ((5, 1, 2, 1, 1, 64, 14) if receives else (5, 1, 1, 1, 2, 64, 14))
-    assert tau.shape == (5, 1, 1, 64)
-    middle = slice(20, -20)  # at the band's ends taps at whole samples fit worst
-    tones = torch.from_numpy((TONES - TONES.mean())[middle].astype(np.float32))
-    heard = cir_to_ofdm_channel(tones, gain, tau).numpy().reshape(5, 2, 14, -1)
-    begin = np.random.default_rng(3).uniform(0, 1, 5) * (0.5 - 13 / 28e3)
-    for one, start in zip(heard, begin, strict=True):
-        expected = ray.csi(rx=way.at(start + np.arange(14) / 28e3))[:, :2, middle].transpose(1, 0, 2)
-        assert np.mean(np.abs(one - expected) ** 2) < 1e-3 * np.mean(np.abs(expected) ** 2)
-    with pytest.raises(ValueError, match="from a trajectory of"):
-        model(1, 20, 10.0)
-
-
-@pytest.mark.slow
-def test_a_link_over_exported_taps_is_the_link_study(tmp_path):
+def test_a_link_over_exported_taps_is_the_link_study():
     """The same blocks in the same noise: over the model's channels, as `gsparc link`, and over its taps."""
     sionna = pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
-    from sionna.phy.channel import cir_to_ofdm_channel
-
     from gsparc.apps.link.adaptation import Band
     from gsparc.apps.link.pusch import Pusch
 
     tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
     ray, way = Rays(tones, True), drive()
-    model = played(tmp_path / "cir.npz", fitted(ray, way, 32, 30.72e6), 32)
-    gain, tau = model(32, 1, 1.0)  # still while a slot lasts
-    offset = torch.from_numpy((tones - CARRIER).astype(np.float32))
-    exported = cir_to_ofdm_channel(offset, gain, tau).reshape(32, 48)
-    begin = np.random.default_rng(3).uniform(0, 1, 32) * 0.5
+    line, begin = fitted(ray, way, 32, 30.72e6), np.random.default_rng(3).uniform(0, 1, 32) * 0.5
+    delay = (line.first + np.arange(32)) / line.rate_hz
+    taps = CubicSpline(line.time_s, line.gain)(begin)[:, 0]  # still while a slot lasts
+    summed = taps @ np.exp(-2j * np.pi * np.outer(delay, tones - CARRIER))
+    exported = torch.from_numpy(summed.astype(np.complex64))
     study = torch.from_numpy(ray.csi(rx=way.at(begin))[:, 0].astype(np.complex64))
     assert (exported - study).abs().square().mean() < 1e-5 * study.abs().square().mean()
-    pusch = Pusch("qpsk", 4, 30, np.ones(48, complex), 8, ["perfect", "predicted"])
+    pusch = Pusch("qpsk", 4, 30, np.ones(48, complex), 8, False)
     blocks = []
     for heard in (study, exported):
         torch.manual_seed(0)

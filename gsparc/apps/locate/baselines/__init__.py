@@ -1,1 +1,0 @@
-"""Published ways from features to a place, behind one protocol."""

@@ -1,0 +1,59 @@
+"""Fingerprints, levels of access points whose places nobody knows, placed by the nearest rows."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.apps.locate.judging import Localisation, sample
+from gsparc.apps.locate.neighbours import located_by
+from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.data.datasets.fingerprints import Fingerprints, parted, read_fingerprints
+from gsparc.data.limits import POSITIVE, SHARE
+
+METHOD = "weighted_knn"
+
+
+def by_fingerprints(config: DictConfig) -> Localisation:
+    """Locate rows of a file by its others, or rows of another file.
+
+    Args:
+        config: see conf/locate.yaml.
+
+    Raises:
+        ValueError: no file, a checkpoint as well, or settings that only a trained model has.
+    """
+    chosen = config.dataset
+    if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
+        raise ValueError("dataset=fingerprints learns from its own rows: give dataset.file=FILE, and no ckpt")
+    if config.offset_db is not None or config.plan is not None or config.prior != "box":
+        raise ValueError("offset_db, plan, prior: of trained models alone, not of fingerprints")
+    POSITIVE.check("dataset.side_m", chosen.side_m)
+    SHARE.check("dataset.held_out", chosen.held_out)
+    rows = read_fingerprints(chosen.file)
+    how: Any = "file" if config.data else chosen.split
+    cut = float(chosen.side_m), float(chosen.held_out)
+    if config.data:
+        known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
+    else:
+        known, heard = map(rows.at, parted(rows, how, *cut, int(config.seed)))
+    heard = heard.at(sample(config, len(heard.level)))
+    place, each_ms, fit_s = located_by(METHOD, as_snapshots(known), as_snapshots(heard))
+    facts = {
+        "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
+        "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
+    }  # fmt: skip
+    placed = bool(np.isfinite(heard.position).all())
+    both = as_snapshots(heard), as_snapshots(known)
+    return Localisation(METHOD, place, *both, np.zeros(3), placed, {}, None, each_ms, "", facts)
+
+
+def as_snapshots(rows: Fingerprints) -> Snapshots:
+    """Return rows as snapshots of powers."""
+    values = torch.from_numpy(rows.level).double()
+    return Snapshots("rssi", values, None, rows.position, np.arange(len(values)))
