@@ -46,7 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     promises = [
         (f"{projection}, {threads} threads", claim)
         for projection, threads in product(config.projections, config.threads)
-        for claim in claims(projection, list(config.counts), threads, max(config.batches), machine, clock)
+        for claim in claims(projection, list(config.counts), threads, machine, clock)
     ]
     summary: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}
     summary |= {"machine/instruction_set": instruction_set(), "machine/load_before": before}

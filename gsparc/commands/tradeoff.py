@@ -25,7 +25,7 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
 from gsparc.models.pareto import front
-from gsparc.models.reduced import combinations, contributions, reduced
+from gsparc.models.reduced import combinations, reduced
 from gsparc.prediction import operating_point
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, percentiles, reference_copy
@@ -51,7 +51,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     rows = rows_of(fold, config.eval_on)
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    measured = contributions(method, data, learned)
+    measured = method.contributions(data, learned)
     settings = list(combinations(method, plain(config.grid), plain(config.singles)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)

@@ -26,6 +26,7 @@ from gsparc.data.moments import Snapshots, moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning, words
+from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import weights_of
 from gsparc.processes.neighbourhood import covering, spacing
@@ -106,29 +107,20 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
 
 def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
     """Return the first of `rows` at each place and station, and measurements where these are the means."""
-    if not len(rows):
-        return rows, data
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-    _, first, packet, count = np.unique(
-        np.c_[data.moving[rows], station],
-        axis=0, return_index=True, return_inverse=True, return_counts=True,
-    )  # fmt: skip
-    if len(first) == len(rows):  # one packet of each: nothing to copy
+    packets, seen = np.c_[data.moving[rows], station], None if data.mask is None else data.mask[rows]
+    first, mean, count = mean_at_places(packets, data.target[rows], seen)
+    if len(first) == len(rows):
         return rows, data
-    first, packet, target = rows[first], packet.reshape(-1), np.array(data.target)
-    measured = np.ones_like(target[rows], bool) if data.mask is None else data.mask[rows]
-    total, several = np.zeros((2, len(first), *target.shape[1:]), target.dtype)
-    np.add.at(total, packet, np.where(measured, target[rows], 0))
-    np.add.at(several, packet, measured)
-    target[first] = total / np.maximum(several.real, 1)
-    mask, noise = data.mask, data.noise_variance
-    if mask is not None:
-        mask = np.array(mask)
-        mask[first] = several.real > 0  # an entry that any of the packets measured
-    if noise is not None:
-        noise = np.array(noise)
-        noise[first] /= count.reshape(-1, *[1] * (noise.ndim - 1))
-    return np.sort(first), replace(data, target=target, mask=mask, noise_variance=noise)
+    means = {"target": mean}
+    if seen is not None:  # an entry that any of the packets measured
+        means["mask"] = mean_at_places(packets, seen.astype(np.float32))[1] > 0
+    if (noise := data.noise_variance) is not None:
+        means["noise_variance"] = noise[rows[first]] / count.reshape(-1, *[1] * (noise.ndim - 1))
+    for name, values in means.items():
+        means[name] = whole = np.array(getattr(data, name))
+        whole[rows[first]] = values
+    return np.sort(rows[first]), replace(data, **means)  # type: ignore[arg-type]
 
 
 def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:

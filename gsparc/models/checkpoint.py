@@ -91,15 +91,10 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     if site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
     content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "method": method.name,
-        "target": import_path(method.stored_as),
-        "config": config,
-        "site": _plain(asdict(site), "site"),
-        "state": _plain(method.state(), "state"),
+        "format": FORMAT, "version": VERSION, "method": method.name, "target": import_path(method.stored_as),
+        "config": config, "site": _plain(asdict(site), "site"), "state": _plain(method.state(), "state"),
         "extra": _plain(dict(extra or {}), "extra"),
-    }
+    }  # fmt: skip
     _write(Path(path), content)
 
 
@@ -201,14 +196,10 @@ def _without_unknown_places(part: Any) -> Any:
 def _stored(content: Mapping[str, Any], path: Path) -> Stored:
     try:
         return Stored(
-            method=str(content["method"]),
-            target=str(content["target"]),
-            config=str(content["config"]),
-            site=_site_from(content["site"]),
-            state=dict(content["state"]),
-            extra=dict(content["extra"]),
+            method=str(content["method"]), target=str(content["target"]), config=str(content["config"]),
+            site=_site_from(content["site"]), state=dict(content["state"]), extra=dict(content["extra"]),
             path=path,
-        )
+        )  # fmt: skip
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
 

@@ -78,7 +78,7 @@ class ClosedForm(Method):
         yield 1.0, self
 
 
-def stored(method: ClosedForm) -> dict[str, Any]:
+def stored(method: Method) -> dict[str, Any]:
     """Return what `restored` reads."""
     return {"target": import_path(method.stored_as), "state": method.state()}
 

@@ -7,21 +7,20 @@ left as queries will be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial.distance import cdist
-from torch import Tensor
 
 from gsparc.models.baselines.gp import choose_kernel
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import left_out_around
+from gsparc.processes.stored import Stored
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOut(Stored):
     """Training spectra predicted without their neighbours.
 
     Attributes:
@@ -37,15 +36,6 @@ class LeftOut:
     centres: np.ndarray
     gaps: np.ndarray
     predicted: np.ndarray
-
-    def state(self) -> dict[str, Tensor]:
-        """Return what the checkpoint of a training that may be interrupted stores."""
-        return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in vars(self).items()}
-
-    @classmethod
-    def of(cls, state: Mapping[str, Tensor] | None) -> LeftOut | None:
-        """Return what had this `state()`; None of None."""
-        return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
     def by_process(self) -> np.ndarray:
         """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""

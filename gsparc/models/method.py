@@ -180,6 +180,23 @@ class Method(MethodFactory):
         """Return the number of Gaussians, sources or stored training samples."""
         return 0
 
+    @property
+    def reducible(self) -> Method | None:
+        """The part of it that answers faster and less accurately when asked to; None: it does so itself."""
+        return None
+
+    def knobs(self) -> tuple[str, ...]:
+        """Return names of the settings of `reduced` that mean something to what was fitted; here none."""
+        return () if self.reducible is None else self.reducible.knobs()
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Return what must be known of training rows (n,) to reduce it; stored with the model."""
+        return {} if self.reducible is None else self.reducible.contributions(data, rows)
+
+    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+        """Return a method that answers with these settings; this one is left as it is."""
+        return self if self.reducible is None else self.reducible.reduced(settings, measured)
+
     def objects(self) -> SiteObjects:
         """Return what it found to stand in the site."""
         return SiteObjects.of()
@@ -246,6 +263,12 @@ def suited_threads(method: Method, places: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def answered(method: Method, query: Query) -> Prediction:
+    """Return what a method predicts, by as many threads as suit the query."""
+    with suited_threads(method, len(query)):
+        return method.predict(query)
+
+
 @runtime_checkable
 class Reconditions(Protocol):
     """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
@@ -293,17 +316,3 @@ class HasGaussians(Protocol):
         Raises:
             ValueError: what was fitted here has none.
         """
-
-
-@runtime_checkable
-class Reducible(Protocol):
-    """Answers faster and less accurately when asked to."""
-
-    def knobs(self) -> tuple[str, ...]:
-        """Return names of the settings that mean something to what was fitted."""
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return what must be known of training rows (n,) to reduce it; stored with the model."""
-
-    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
-        """Return a method that answers with these settings; this one is left as it is."""

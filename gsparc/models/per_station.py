@@ -27,8 +27,9 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
+from gsparc.models.closed_form import stored
 from gsparc.models.fitting import common_label
-from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions, import_path
+from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard
 from gsparc.training.context import FitContext, FitReport
@@ -293,10 +294,7 @@ class PerStation(Method):
 
     def state(self) -> dict[str, Any]:
         """Return the class and state of every copy, by its station's number."""
-        copies = {
-            str(number): {"target": import_path(copy.stored_as), "state": copy.state()}
-            for number, copy in self._copies.items()
-        }
+        copies = {str(number): stored(copy) for number, copy in self._copies.items()}
         return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -334,6 +332,11 @@ class OfStation(View):
         super().__init__(inner)
         self.number = number
 
+    def joint(self) -> HasJoint | None:
+        """Return what knows how levels of stations go together; None where nothing does."""
+        method = getattr(self.inner, "only", None)
+        return method if isinstance(method, HasJoint) else None
+
     def gradient_problem(self) -> str | None:
         """Return that of all stations."""
         return self.inner.gradient_problem()
@@ -349,11 +352,6 @@ class OfStations(OfStation):
     def __init__(self, inner: Method, count: int) -> None:
         super().__init__(inner, UNHEARD)
         self.count = count
-
-    def joint(self) -> HasJoint | None:
-        """Return what knows how levels of stations go together; None where nothing does."""
-        method = getattr(self.inner, "only", None)
-        return method if isinstance(method, HasJoint) else None
 
     def predict(self, query: Query) -> Prediction:
         """Mean and variance (B, T); the ends that stand are not read."""

@@ -8,14 +8,12 @@ from dataclasses import replace
 from itertools import product
 from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
-from gsparc.models.method import Method, Prediction, Reducible
+from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.ops import SphereGrid
 
@@ -25,40 +23,9 @@ AS_TRAINED = {"keep": 1.0, "stride": 1, "confidence": True}  # else: None
 Measured = dict[str, Tensor]
 
 
-def knobs(method: Method) -> tuple[str, ...]:
-    """Return names of the settings that mean something to a method; none where it is not `Reducible`."""
-    return method.knobs() if isinstance(method, Reducible) else ()
-
-
-def contributions(method: Method, data: Measurements, rows: np.ndarray) -> Measured:
-    """Return what must be known of training rows (n,) to reduce a method; stored with the model."""
-    return method.contributions(data, rows) if isinstance(method, Reducible) else {}
-
-
 def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
     """Return the method with `settings`; itself when there are none."""
-    return method.reduced(settings, measured) if settings and isinstance(method, Reducible) else method
-
-
-class ReducedByPart(Method):
-    """Answers faster where a part of it does."""
-
-    @property
-    def reducible(self) -> Method | None:
-        """The part; None where it answers as it is."""
-        return None
-
-    def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
-        return () if self.reducible is None else knobs(self.reducible)
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> Measured:
-        """See `Reducible`."""
-        return {} if self.reducible is None else contributions(self.reducible, data, rows)
-
-    def reduced(self, settings: Settings, measured: Measured) -> Method:
-        """See `Reducible`."""
-        return self if self.reducible is None else reduced(self.reducible, settings, measured)
+    return method.reduced(settings, measured) if settings else method
 
 
 def combinations(
@@ -68,7 +35,7 @@ def combinations(
 
     Strides must divide the columns, others are left out with a warning.
     """
-    known = knobs(method)
+    known = method.knobs()
     single = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
     axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
     if "stride" in axes:

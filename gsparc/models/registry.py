@@ -59,7 +59,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     if target is None:
         raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
     from gsparc.models.method import MethodFactory
-    from gsparc.processes.term import KINDS
+    from gsparc.processes.stored import KINDS
 
     if not trusted:
         for path in targets(OmegaConf.to_container(node, resolve=False)):

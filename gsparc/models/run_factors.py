@@ -15,13 +15,14 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Prediction
+from gsparc.processes.stored import Stored
 
 SWEEPS = 200  # of all factors in turn, at most
 SETTLED = 1e-9  # largest change of a factor, of the largest factor, at which they end
 
 
 @dataclass(frozen=True)
-class RunFactors:
+class RunFactors(Stored):
     """What the channels of each run were multiplied by, relative to the largest run's.
 
     Attributes:
@@ -70,15 +71,6 @@ class RunFactors:
         target = (data.target / factor[:, None, None]).astype(data.target.dtype)
         noise = None if data.noise_variance is None else data.noise_variance / np.abs(factor) ** 2
         return replace(data, target=target, noise_variance=noise, run=None)
-
-    def state(self) -> dict[str, Tensor]:
-        """Return what `read` reads."""
-        return {"runs": torch.from_numpy(self.runs), "factors": self.factors}
-
-    @staticmethod
-    def read(state: dict[str, Tensor] | None) -> RunFactors:
-        """Make what had this `state`; `none` of None."""
-        return RunFactors.none() if state is None else RunFactors(state["runs"].numpy(), state["factors"])
 
 
 def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:

@@ -105,12 +105,9 @@ def called_for(
 
 
 def _refuse_scene(
-    data: Measurements,
-    switches: EffectSettings,
-    obstacles: dict[str, str | None],
-    on: dict[str, bool],
+    data: Measurements, switches: EffectSettings, obstacles: dict[str, str | None], on: dict[str, bool],
     count: int,
-) -> None:
+) -> None:  # fmt: skip
     """`ValueError` where known walls explain nothing."""
     site, why = data.site, None
     term = {"csi": "phase", "rssi": "power"}.get(site.kind)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,18 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.schema import Measurements
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
-from gsparc.models.method import Method, Prediction, predictions
+from gsparc.models.method import Method, Prediction, answered, predictions
 from gsparc.models.target_rows import training_targets
+from gsparc.prediction.query import Queries, returned
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, joined
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
+from gsparc.processes.stored import Stored, restored, stored
 
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
@@ -102,7 +105,7 @@ KEY = "confidence"
 
 
 @dataclass(frozen=True)
-class Trusted:
+class Trusted(Stored):
     """The confidence that was best on positions set aside, and a threshold that promises something.
 
     Attributes:
@@ -169,22 +172,87 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    kernel = None if trusted.kernel is None else trusted.kernel.state()
-    checkpoint.amend(path, {KEY: {**asdict(trusted), "kernel": kernel}})
+    checkpoint.amend(path, {KEY: stored(trusted)})
 
 
 def trusted_of(extra: Mapping[str, Any]) -> Trusted:
     """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
-    state = extra.get(KEY)
-    if state is None:
-        return Trusted()
-    promise = None if state["promise"] is None else Guarantee(**state["promise"])
-    kernel = None if state["kernel"] is None else Kernel.read(state["kernel"])
-    known = np.asarray(state["known"], np.float64)
-    return Trusted(state["kind"], float(state["threshold"]), promise, known, kernel)
+    return restored(extra[KEY]) if KEY in extra else Trusted()
 
 
 def threshold_of(kind: str, threshold: Threshold) -> float:
     """Return a threshold of scores as one of confidences."""
     value = np.array(threshold.value)
     return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")
+
+
+class Judging:
+    """What a `Predictor` says of how good its answers are."""
+
+    site: Site
+    method: Method
+    _whole: Method
+    queries: Queries
+    trusted: Trusted
+    kind: str | None
+
+    def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
+        """Return how sure the model is, (B,) float32 in [0, 1], larger is surer.
+
+        Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
+        `gsparc calibrate` found best, else the model's own.
+
+        >>> near, far = predictor.confidence(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]])
+        >>> bool(near > far)  # 900 m away from everything measured
+        True
+
+        Raises:
+            ValueError: the method has no confidence of that kind.
+        """
+        return returned(*self._sure(tx, rx, uplink))
+
+    def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
+        """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
+
+        None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+
+        >>> predictor.accepts(rx=[2.0, 1.0, 1.5])
+        Traceback (most recent call last):
+            ...
+        ValueError: accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not
+
+        Raises:
+            ValueError: the model was never calibrated, or for another kind of confidence.
+        """
+        if self.trusted.promise is None:
+            raise ValueError(
+                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not"
+            )
+        if self.kind not in (None, self.trusted.kind):
+            raise ValueError(
+                f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
+            )
+        sure, single, as_torch = self._sure(tx, rx, uplink)
+        good = returned(sure >= self.trusted.threshold, single, as_torch)
+        return bool(good) if single and not as_torch else good
+
+    def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
+        """Confidences (B,), whether one was wanted, and whether torch was given."""
+        if uplink is not None:
+            from gsparc.prediction import channels
+
+            sure = self._confidence(channels.judged(self.method, self.site, uplink), None)
+            single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
+        else:
+            query, single, as_torch = self.queries.query(tx, rx)
+            sure = self._confidence(answered(self._whole, query), query)
+        if sure is None:
+            raise ValueError(f"{self.method.name} has no confidence")
+        return sure, single, as_torch
+
+    def _confidence(self, own: Prediction, query: Query | None) -> Tensor | None:
+        """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
+        if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+            return None
+        places = None if query is None else query.places(self.site).numpy()
+        return torch.from_numpy(self.trusted.confidence(own, places, self.kind))

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,19 @@ import numpy as np
 import torch
 
 from gsparc.models import checkpoint, loading
-from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method
 from gsparc.models.pareto import Point, Settings
 from gsparc.models.reduced import Measured, reduced
 from gsparc.prediction.confidence import trusted_of
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, interleaved
+from gsparc.processes.stored import Stored, restored, stored
 
 KEY = "operating"
 
 
 @dataclass(frozen=True)
-class Operating:
+class Operating(Stored):
     """One stored way of answering.
 
     Attributes:
@@ -48,18 +48,17 @@ class Operating:
 
 def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -> None:
     """Store points in a checkpoint, replacing earlier ones; the file is rewritten whole or not at all."""
-    stored = [
+    found = [
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.amend(path, {KEY: {"points": [asdict(point) for point in stored], "measured": measured}})
+    checkpoint.amend(path, {KEY: {"points": stored(found), "measured": measured}})
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
     """Return the points in a checkpoint's `extra`, none when it was never swept."""
     sweep = extra.get(KEY) or {"points": [], "measured": {}}
-    points = [Operating(**{**point, "figure": tuple(point["figure"])}) for point in sweep["points"]]
-    return points, dict(sweep["measured"])
+    return [*restored(sweep["points"])], dict(sweep["measured"])
 
 
 log = logging.getLogger(__name__)
@@ -69,7 +68,7 @@ QUANTILE = 0.75  # a point fits when three of four of its queries did: its media
 QUERIES = 16  # at places drawn in the scene's box
 
 
-def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Operating]:
+def within(method: Method, stored: checkpoint.Stored, budget_ms: float) -> tuple[Method, Operating]:
     """Choose the most accurate stored operating point that takes at most `budget_ms` on this machine.
 
     Sets torch's number of threads to the point's.

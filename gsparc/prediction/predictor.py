@@ -17,23 +17,22 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
-from gsparc.models.method import HasGaussians, Method, Prediction, suited_threads
+from gsparc.models.method import HasGaussians, Method, Prediction, answered
 from gsparc.models.per_station import PerStation, of_station
-from gsparc.ops import Pose
-from gsparc.ops.transforms import carries_tangent, mapped, transforming
 from gsparc.physics.row_factors import words
-from gsparc.prediction.confidence import Trusted
-from gsparc.prediction.query import Queries, read_places, usual_heights
+from gsparc.prediction.confidence import Judging, Trusted
+from gsparc.prediction.gradients import followed
+from gsparc.prediction.jointly import Jointly
+from gsparc.prediction.query import InDegrees, Queries, returned
 from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
-    from gsparc.data.links.georeference import Georeference
     from gsparc.data.site_objects import GaussianCloud
     from gsparc.prediction.channels import Paths
     from gsparc.prediction.operating_point import Operating
 
 
-class Predictor:
+class Predictor(InDegrees, Jointly, Judging):
     """A fitted method in world coordinates.
 
     Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
@@ -77,7 +76,7 @@ class Predictor:
         self.method, self.site, self.point = method, site, point
         # A reduced method answers means alone: what states variance or confidence asks the whole one.
         self._whole = whole or method
-        self._query = Queries(site).query
+        self.queries = Queries(site)
         self._unit = unit
         self.unit = self._in(None).name  # "1" of channels and spectra
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
@@ -115,66 +114,14 @@ class Predictor:
         method, whole = (
             one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
         )
-        site = of_station(self.site, number)
-        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, self._unit)
+        return self._with(method, whole, of_station(self.site, number), self._unit)
+
+    def _with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
+        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
 
     def in_levels(self, unit: str | None) -> Predictor:
         """Return the same model whose powers are levels in a unit, dBm or dBW; None: as measured."""
-        method, whole, extra = self.method, self._whole, self.extra
-        return Predictor(method, self.site.in_levels(unit), whole, self.point, self.trusted, self.kind, extra)
-
-    def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
-        """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
-
-        >>> city = gsparc.load("city.ckpt")
-        >>> city.at("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
-        (1,)
-
-        Args:
-            latitude, longitude: [deg], longitude to the east.
-            height: () or (B,) [m]; None for the one height at which the moving end was measured.
-
-        Raises:
-            ValueError: measured in metres about an unknown origin, degrees that are not on Earth, or no
-                height where the moving end had several.
-        """
-        origin = self._georeference()
-        if height is None:
-            height = usual_heights(self.site).get(self.site.moving_end)
-        if height is None:
-            raise ValueError(f"height= is needed: the {self.site.moving_end} had several, or none is known")
-        single = np.ndim(latitude) == 0 and np.ndim(longitude) == 0 and np.ndim(height) == 0
-        across = origin.from_degrees(latitude, longitude)
-        try:
-            above = np.broadcast_to(np.asarray(height, np.float64), len(across))
-        except (TypeError, ValueError):
-            raise ValueError(f"height= must be one number or {len(across)} [m]") from None
-        places = np.column_stack([across, above])
-        return places[0] if single else places
-
-    def degrees(self, position: Any) -> tuple[Any, Any, Any]:
-        """Return latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
-
-        >>> latitude, longitude, height = gsparc.load("city.ckpt").degrees([0.0, 0.0, 1.5])
-        >>> height
-        1.5
-
-        Raises:
-            ValueError: measured in metres about an unknown origin, or no positions.
-        """
-        origin = self._georeference()
-        places = read_places("position", position)
-        latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
-        if places.ndim == 1:
-            return float(latitude[0]), float(longitude[0]), float(places[2])
-        return latitude, longitude, places[:, 2]
-
-    def _georeference(self) -> Georeference:
-        if self.site.georeference is None:
-            raise ValueError(
-                f"{self.site.name} was measured in metres about an unknown origin, not in degrees"
-            )
-        return self.site.georeference
+        return self._with(self.method, self._whole, self.site.in_levels(unit), None)
 
     def _in(self, unit: str | None) -> PowerUnit:
         """The unit that answers are wanted in."""
@@ -202,15 +149,15 @@ class Predictor:
         """
         wanted = self._in(unit)
         if grad:
-            return self._followed(self._whole, tx, rx, wanted)[0]
-        query = self._query(tx, rx).query
-        own = _predicted(self._whole, query)
+            return self._slopes(self._whole, tx, rx, wanted)[0]
+        query = self.queries.query(tx, rx).query
+        own = answered(self._whole, query)
         sure = self._confidence(own, query)
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def asked(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local, in stored units."""
-        return _predicted(self.method, query)
+        return answered(self.method, query)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
@@ -233,14 +180,14 @@ class Predictor:
         """
 
         def ask(asked: Predictor) -> Any:
-            query, single, as_torch = asked._query(tx, rx)
-            said = _in_unit(_predicted(asked._whole, query), asked._in(unit))
+            query, single, as_torch = asked.queries.query(tx, rx)
+            said = _in_unit(answered(asked._whole, query), asked._in(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float()
             # As many axes as the answers have, so that both broadcast.
             spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
-            return _returned(spread, single, as_torch)
+            return returned(spread, single, as_torch)
 
         return self._of_stations(ask, tx, rx)
 
@@ -256,10 +203,7 @@ class Predictor:
         # One call for all stations where the method has one, else a call for each.
         every = self.method.every() if isinstance(self.method, PerStation) else None
         if every is not None:
-            site = of_station(self.site, 0)
-            return ask(
-                Predictor(every, site, None, self.point, self.trusted, self.kind, self.extra, self._unit)
-            )
+            return ask(self._with(every, None, of_station(self.site, 0), self._unit))
         stations = self._stations()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)
@@ -342,7 +286,7 @@ class Predictor:
 
         if uplink is not None:
             return channels.uplink_paths(self.method, self.site, uplink)
-        return channels.placed_paths(self._whole, self.site, self._query(tx, rx).query)
+        return channels.placed_paths(self._whole, self.site, self.queries.query(tx, rx).query)
 
     def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
         """Return the Gaussians that are rendered, in the world, with what they emit for these positions.
@@ -352,7 +296,7 @@ class Predictor:
         """
         if not isinstance(self.method, HasGaussians):
             raise ValueError(f"gaussians: {self.method.name} renders none")
-        cloud = self.method.gaussians(self._query(tx, rx).query)
+        cloud = self.method.gaussians(self.queries.query(tx, rx).query)
         return replace(cloud, means=cloud.means + self.site.origin)
 
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
@@ -374,67 +318,6 @@ class Predictor:
         """
         return self._of_stations(lambda one: one._ask("rssi", tx, rx, grad, unit), tx, rx)
 
-    def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Return how sure the model is, (B,) float32 in [0, 1], larger is surer.
-
-        Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
-        `gsparc calibrate` found best, else the model's own.
-
-        >>> near, far = predictor.confidence(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]])
-        >>> bool(near > far)  # 900 m away from everything measured
-        True
-
-        Raises:
-            ValueError: the method has no confidence of that kind.
-        """
-        return _returned(*self._sure(tx, rx, uplink))
-
-    def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
-
-        None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
-
-        >>> predictor.accepts(rx=[2.0, 1.0, 1.5])
-        Traceback (most recent call last):
-            ...
-        ValueError: accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not
-
-        Raises:
-            ValueError: the model was never calibrated, or for another kind of confidence.
-        """
-        if self.trusted.promise is None:
-            raise ValueError(
-                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not"
-            )
-        if self.kind not in (None, self.trusted.kind):
-            raise ValueError(
-                f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
-            )
-        sure, single, as_torch = self._sure(tx, rx, uplink)
-        good = _returned(sure >= self.trusted.threshold, single, as_torch)
-        return bool(good) if single and not as_torch else good
-
-    def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
-        """Confidences (B,), whether one was wanted, and whether torch was given."""
-        if uplink is not None:
-            from gsparc.prediction import channels
-
-            sure = self._confidence(channels.judged(self.method, self.site, uplink), None)
-            single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
-        else:
-            query, single, as_torch = self._query(tx, rx)
-            sure = self._confidence(_predicted(self._whole, query), query)
-        if sure is None:
-            raise ValueError(f"{self.method.name} has no confidence")
-        return sure, single, as_torch
-
-    def _confidence(self, own: Prediction, query: Query | None) -> Tensor | None:
-        """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
-        if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
-            return None
-        places = None if query is None else query.places(self.site).numpy()
-        return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
-
     def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
         if self.site.kind != kind:
             raise ValueError(
@@ -443,59 +326,23 @@ class Predictor:
             )
         wanted = self._in(unit)
         if grad:
-            moments, single = self._followed(self.method, tx, rx, wanted)
+            moments, single = self._slopes(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
-        query, single, as_torch = self._query(tx, rx)
-        return _returned(_in_unit(_predicted(self.method, query), wanted).mean, single, as_torch)
+        query, single, as_torch = self.queries.query(tx, rx)
+        return returned(_in_unit(answered(self.method, query), wanted).mean, single, as_torch)
 
-    def _followed(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
+    def _slopes(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
-        problem = method.gradient_problem()
-        if problem is not None:
-            raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
-        ends, fixed = {"tx": tx, "rx": rx}, []
-        if isinstance(rx, Pose):
-            # Gradients are by the position of a pose; its rotation must not ask for one.
-            ends["rx"], fixed = rx.position, [rx.rotation]
-        if self.site.static_end is not None:
-            fixed.append(ends.pop(self.site.static_end))
-        for end, value in ends.items():
-            if value is not None and not isinstance(value, Tensor):
-                raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
-        if mapped(*ends.values()):
-            raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
-        if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
-            raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
-        query, single, _ = self._query(tx, rx, torch.float64)
-        origin = torch.from_numpy(np.asarray(self.site.origin, np.float64))
-        # The origin goes in float64: in UTM coordinates float32 has no centimetres.
-        local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
-        at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
-        with suited_threads(method, len(query)):
-            if transforming() and method not in self._prepared:  # what it keeps must not be a transform's
-                self._prepared.append(method)
-                with torch._C._DisableFuncTorch(), torch.no_grad():
-                    method.predict(query)
-            moments = method.predict(replace(query, tx=local.get("tx", query.tx), rx=at))
-        dtype = torch.float32
-        for value in ends.values():
-            # Computed in float64, answered as precisely as the positions were given.
-            dtype = torch.promote_types(dtype, value.dtype)
+        moments, dtype, single = followed(method, self.queries, tx, rx, self._prepared)
         said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
         unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
         return Prediction(mean, said.variance, unknown), single
 
 
-@torch.no_grad()
 def keep(path: str | Path, extra: Mapping[str, Any]) -> None:
     """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
     checkpoint.amend(path, extra)
-
-
-def _predicted(method: Method, query: Query) -> Prediction:
-    with suited_threads(method, len(query)):
-        return method.predict(query)
 
 
 def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
@@ -504,10 +351,3 @@ def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
     variance = None if own.variance is None else unit.variance(own.mean, own.variance)
     explained = None if own.explained is None else unit.values(own.explained).to(own.mean.dtype)
     return Prediction(unit.values(own.mean).to(own.mean.dtype), variance, own.unknown, explained)
-
-
-def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:
-    value = value[0] if single else value
-    if as_torch:
-        return value
-    return value.numpy() if value.ndim else float(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import End, Site
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
+
+if TYPE_CHECKING:
+    from gsparc.data.links.georeference import Georeference
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
@@ -130,6 +133,73 @@ def read_places(end: str, value: Any) -> np.ndarray:
     if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
         raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
     return array
+
+
+def returned(value: Tensor, single: bool, as_torch: bool) -> Any:
+    """Return answers (B, ...) as they were asked for: of one place, as tensors or NumPy arrays."""
+    value = value[0] if single else value
+    if as_torch:
+        return value
+    return value.numpy() if value.ndim else float(value)
+
+
+class InDegrees:
+    """What a `Predictor` says of latitudes and longitudes."""
+
+    site: Site
+
+    def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
+        """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
+
+        >>> city = gsparc.load("city.ckpt")
+        >>> city.at("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
+        (1,)
+
+        Args:
+            latitude, longitude: [deg], longitude to the east.
+            height: () or (B,) [m]; None for the one height at which the moving end was measured.
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, degrees that are not on Earth, or no
+                height where the moving end had several.
+        """
+        origin = self._georeference()
+        if height is None:
+            height = usual_heights(self.site).get(self.site.moving_end)
+        if height is None:
+            raise ValueError(f"height= is needed: the {self.site.moving_end} had several, or none is known")
+        single = np.ndim(latitude) == 0 and np.ndim(longitude) == 0 and np.ndim(height) == 0
+        across = origin.from_degrees(latitude, longitude)
+        try:
+            above = np.broadcast_to(np.asarray(height, np.float64), len(across))
+        except (TypeError, ValueError):
+            raise ValueError(f"height= must be one number or {len(across)} [m]") from None
+        places = np.column_stack([across, above])
+        return places[0] if single else places
+
+    def degrees(self, position: Any) -> tuple[Any, Any, Any]:
+        """Return latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+
+        >>> latitude, longitude, height = gsparc.load("city.ckpt").degrees([0.0, 0.0, 1.5])
+        >>> height
+        1.5
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, or no positions.
+        """
+        origin = self._georeference()
+        places = read_places("position", position)
+        latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
+        if places.ndim == 1:
+            return float(latitude[0]), float(longitude[0]), float(places[2])
+        return latitude, longitude, places[:, 2]
+
+    def _georeference(self) -> Georeference:
+        if self.site.georeference is None:
+            raise ValueError(
+                f"{self.site.name} was measured in metres about an unknown origin, not in degrees"
+            )
+        return self.site.georeference
 
 
 def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:

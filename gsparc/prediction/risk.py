@@ -19,6 +19,7 @@ from scipy.stats import binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.data.spacing import far_apart
+from gsparc.processes.stored import Stored
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
@@ -61,7 +62,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
 
 
 @dataclass(frozen=True)
-class Guarantee(Checked):
+class Guarantee(Stored, Checked):
     """What is promised.
 
     >>> Guarantee(alpha=0.1, delta=0.1).least  # 0.9^22 is below 0.1
@@ -131,12 +132,9 @@ def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
 
 
 def choose(
-    score: np.ndarray,
-    bad: np.ndarray,
-    levels: np.ndarray,
-    promise: Guarantee,
+    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Guarantee,
     group: np.ndarray | None = None,
-) -> Threshold:
+) -> Threshold:  # fmt: skip
     """Choose the laxest threshold that the calibration set (n,) supports.
 
     Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
@@ -325,13 +323,9 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 
 
 def accept(
-    evidence: Evidence,
-    promise: Guarantee,
-    kind: str,
-    spatial: bool,
-    seed: int | list[int],
+    evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int | list[int],
     apart_m: float = 0,
-) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
+) -> tuple[str, Threshold, np.ndarray, np.ndarray]:  # fmt: skip
     """Return confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
 
     Raises:

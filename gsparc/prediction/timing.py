@@ -17,7 +17,7 @@ import torch
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
-from gsparc.models.method import Method, Prediction, suited_threads
+from gsparc.models.method import Method, answered
 
 Key = TypeVar("Key")
 Call = Callable[[int], object]
@@ -110,10 +110,6 @@ def cycling(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key
 
     def call(method: Method) -> Call:
         return lambda turn: answered(method, queries[turn % len(queries)])
-
-    def answered(method: Method, query: Query) -> Prediction:
-        with suited_threads(method, len(query)):
-            return method.predict(query)
 
     return {name: call(method) for name, method in methods.items()}
 

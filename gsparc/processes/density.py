@@ -134,12 +134,9 @@ def gram_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> 
 
 
 def walked(
-    objective: Callable[[Tensor], Tensor],
-    starts: Sequence[np.ndarray],
-    bounds: Sequence[tuple[float, float]],
-    looks: int,
-    tolerance: float,
-) -> tuple[np.ndarray, float]:
+    objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
+    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+) -> tuple[np.ndarray, float]:  # fmt: skip
     """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
 
     >>> best, value = walked(lambda at: (at - 3).square().sum(), [np.zeros(1)], [(-5.0, 5.0)], 50, 1e-12)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.ops.transforms import beyond_kernels
-from gsparc.processes.term import Term, restored, stored
+from gsparc.processes.stored import Stored
+from gsparc.processes.term import Term
 
 LENGTH_SPAN = (1e-3, 3.0)  # bounds of a length, of the median distance between rows
 NOISE_SPAN = (1e-6, 1e2)  # bounds of the noise's variance, of the amplitude
@@ -105,11 +106,7 @@ class Stationary(Term[Tensor]):
 
     def at(self, parameters: Tensor) -> Self:
         """See `Term`."""
-        return replace(self, length=parameters[0].exp())
-
-    def state(self) -> dict[str, Any]:
-        """See `Term`."""
-        return {name: float(value) for name, value in vars(self).items()}
+        return replace(self, length=_number(parameters[0].exp()))
 
 
 class Shadowing(Stationary):
@@ -180,7 +177,7 @@ class IsotropicWaves(Stationary):
 
 
 @dataclass(frozen=True)
-class Kernel:
+class Kernel(Stored):
     """`amplitude (sum of terms + noise identity)`.
 
     >>> kernel = Kernel.matern(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
@@ -281,17 +278,10 @@ class Kernel:
         # Of logits all shares lie between 0 and 1, whatever a step does.
         shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
         given = zip(self.terms, lengths.split(1), shares, strict=True)
-        terms = tuple(replace(term.at(length), share=share) for term, length, share in given)
-        result = replace(self, terms=terms, noise=noise[0].exp())  # type: ignore[arg-type]
-        return result if parameters.requires_grad else self.read(result.state())
+        terms = tuple(replace(term.at(length), share=_number(share)) for term, length, share in given)
+        return replace(self, terms=terms, noise=_number(noise[0].exp()))  # type: ignore[arg-type]
 
-    def state(self) -> dict[str, Any]:
-        """Return numbers that `read` needs."""
-        terms, noise = [stored(term) for term in self.terms], float(self.noise)
-        return {"terms": terms, "noise": noise, "amplitude": self.amplitude}
 
-    @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Self:
-        """Return the kernel whose `state()` this was."""
-        terms = tuple(restored(one) for one in state["terms"])
-        return cls(terms, float(state["noise"]), float(state["amplitude"]))
+def _number(value: Tensor) -> Tensor | float:
+    """A tensor () as it is where gradients flow, else its number."""
+    return value if value.requires_grad else float(value)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -23,10 +23,11 @@ from torch import Tensor
 
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
+from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance, with_nearest
 from gsparc.processes.prior import Answer, Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
@@ -81,12 +82,8 @@ class Values:
     @classmethod
     def of(cls, places: np.ndarray, values: Tensor) -> Values:
         """Average rows at (n, D) with values (n, P) over each place."""
-        unique, group, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
-        counted = torch.from_numpy(count).to(values.dtype)
-        sums = values.new_zeros(len(unique), values.shape[1]).index_add_(
-            0, torch.from_numpy(group.reshape(-1)), values
-        )
-        return cls(unique, sums / counted[:, None], counted.double())
+        first, mean, count = mean_at_places(places, values.numpy())
+        return cls(places[first], torch.from_numpy(mean), torch.from_numpy(count).double())
 
 
 @dataclass(frozen=True)
@@ -195,28 +192,11 @@ class Nearest(Posterior):
         near = Neighbourhood.of(self.near.places[chosen], seed)
         return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
-    def state(self) -> dict[str, Any]:
-        """See `Posterior`."""
-        arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
-        parts = {name: getattr(self, name) for name in ("rest", "noise", "terms", "spread")}
-        return {"prior": self.prior.state(), **arrays, **parts, "most": self.most}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Nearest:
-        """Return the posterior whose `state()` this was."""
-        near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
-        rest, noise, terms, spread = (state[name] for name in ("rest", "noise", "terms", "spread"))
-        return cls(Prior.read(state["prior"]), near, rest, noise, terms, spread, int(state["most"]))
-
 
 def given(
-    prior: Prior,
-    values: Values,
-    seed: int,
-    more: Values | None = None,
-    extra: Tensor | None = None,
+    prior: Prior, values: Values, seed: int, more: Values | None = None, extra: Tensor | None = None,
     most: int = NEIGHBOURS,
-) -> Nearest:
+) -> Nearest:  # fmt: skip
     """Return the process given places, with settings as they are.
 
     >>> line = np.linspace(0.0, 9.0, 10)[:, None]
@@ -371,9 +351,8 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
     for own in sets:
-        row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
-        tree = cKDTree(values.places[own])  # the nearest of all is the row itself
-        parts.append(own[tree.query(values.places[row], k=LOOKED_BY + 1)[1]])
+        row = covering(values.places[own], LOOKED_AT // len(sets), seed)
+        parts.append(own[with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
     sample = Sample.of(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsparc.ops.transforms import followed, numbers
 from gsparc.processes.kernel import apart
+from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets
@@ -57,7 +58,7 @@ def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class Neighbourhood(Stored):
     """Places in sets that are ever sparser and cover the site.
 
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
@@ -127,6 +128,17 @@ class Neighbourhood:
                 row = np.take_along_axis(row, later, 1)
             result.append(row)
         return np.concatenate(result, 1)
+
+
+def with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOURS) -> np.ndarray:
+    """Return rows (T, 1 + most): each of `row` (T,), then its nearest others among places (n, D).
+
+    >>> with_nearest(np.array([[0.0], [3.0], [1.0]]), np.array([0]))
+    array([[0, 2, 1]])
+    """
+    # A row need not come first among its neighbours, as others may lie at its place.
+    alike = Neighbourhood(places, np.zeros(len(places), np.int8))
+    return np.c_[row, alike.nearest(places[row], row, most)]
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,13 +50,9 @@ class Exact(Posterior):
 
     @classmethod
     def of(
-        cls,
-        prior: Prior,
-        places: Tensor,
-        values: Tensor,
-        extra: Tensor | None = None,
+        cls, prior: Prior, places: Tensor, values: Tensor, extra: Tensor | None = None,
         factor: Factor | None = None,
-    ) -> Exact:
+    ) -> Exact:  # fmt: skip
         """Condition on values (n, P) at places (n, D) float64 [m]; with their factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
@@ -138,21 +133,6 @@ class Exact(Posterior):
         cross = self.cross(queries, self.prior.columns(queries))
         white = self.factor.whitened(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
-
-    def state(self) -> dict[str, Any]:
-        """See `Posterior`."""
-        arrays = {"rows": self.rows, "weights": self.weights, "extra": self.extra}
-        return {"prior": self.prior.state(), **arrays}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Exact:
-        """Return the posterior whose `state()` this was."""
-        return cls(**{**state, "prior": Prior.read(state["prior"])})
-
-
-def posterior_of(state: dict[str, Any]) -> Exact | Nearest:
-    """Return the posterior whose `state()` this was."""
-    return Nearest.read(state) if "level" in state else Exact.read(state)
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import mixture
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, propagate
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest, Values, given
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior, posterior_of
+from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Law, Trend
 
 MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
@@ -87,7 +88,7 @@ def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
 
 
 @dataclass(frozen=True)
-class PowerProcess:
+class PowerProcess(Stored):
     """A process of powers given rows, or several whose weighed mean is the answer.
 
     Attributes:
@@ -130,7 +131,7 @@ class PowerProcess:
         """
         if self.others:
             parts = [(share, *one.answer(queries)) for share, one in self.members]
-            mean, variance = averaged([part[:3] for part in parts])
+            mean, variance = mixture([part[:3] for part in parts])
             return mean, variance, sum((part[0] * part[3] for part in parts), torch.zeros_like(mean))
         result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
@@ -164,7 +165,7 @@ class PowerProcess:
             exact = one.posterior if isinstance(one.posterior, Exact) else None
             heard = torch.from_numpy(at) if exact is None else exact.extra == 0
             parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
-        return averaged(parts)
+        return mixture(parts)
 
     def exact(self) -> PowerProcess:
         """Return the first alone, with covariances between places; of many rows, given some of them."""
@@ -176,32 +177,6 @@ class PowerProcess:
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
-
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `read` needs."""
-        others = [{**one.state(), "share": share} for share, one in self.others]
-        return {"posterior": self.posterior.state(), "heard": self.heard, "others": others}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> PowerProcess:
-        """Return the process whose `state()` this was."""
-        others = tuple((float(one["share"]), cls.read(one)) for one in state["others"])
-        return cls(posterior_of(state["posterior"]), float(state["heard"]), others)
-
-
-def averaged(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Return mean and variance (n,) of a mixture of (share, mean, variance), disagreement of means included.
-
-    >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
-    >>> averaged([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
-    (tensor([-75.]), tensor([29.]))
-    """
-    if len(parts) == 1:
-        return parts[0][1:]
-    mean = sum((share * one for share, one, _ in parts), torch.zeros_like(parts[0][1]))
-    # The law of total variance: within the members, and between their means.
-    spread = [share * (variance + (one - mean).square()) for share, one, variance in parts]
-    return mean, torch.stack(spread).sum(0)
 
 
 def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:

@@ -5,19 +5,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.sectors import SectorKernel
-from gsparc.processes.term import restored, stored
+from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Trend
 
 
 @dataclass(frozen=True)
-class Prior:
+class Prior(Stored):
     """`trend + process of the kernel`; covariances are relative to the kernel's amplitude.
 
     Attributes:
@@ -46,17 +45,6 @@ class Prior:
         # Weights of columns have unit variance, and so has the kernel.
         return columns.square().sum(1) + (1 + self.kernel.noise)
 
-    def state(self) -> dict[str, Any]:
-        """Return numbers that `read` needs."""
-        trend = {} if self.trend is None else {"trend": stored(self.trend)}
-        return {"kernel": self.kernel.state(), **trend}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Prior:
-        """Return the prior whose `state()` this was."""
-        kind: Any = SectorKernel if "site_kernel" in state["kernel"] else Kernel
-        return cls(kind.read(state["kernel"]), restored(state["trend"]) if "trend" in state else None)
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -71,7 +59,7 @@ class Answer:
     left: Tensor
 
 
-class Posterior(ABC):
+class Posterior(Stored, ABC):
     """See `gsparc.processes.posterior.Exact` and `gsparc.processes.nearest.Nearest`."""
 
     approximation: ClassVar[str | None] = None  # how, where it is not exact
@@ -100,10 +88,6 @@ class Posterior(ABC):
     @abstractmethod
     def distance(self, queries: Tensor) -> Tensor:
         """Return distances (B,) [m] from places (B, D) to the nearest row."""
-
-    @abstractmethod
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `read` needs."""
 
     @cached_property
     def extent(self) -> float:

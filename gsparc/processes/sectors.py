@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import apart
+from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Trend
 
 ELEVATION_FLOOR_DB = 20.0
@@ -119,7 +120,7 @@ class Sectors(Trend):
 
 
 @dataclass(frozen=True)
-class SectorKernel:
+class SectorKernel(Stored):
     """`amplitude (a exp(site) + same sector (b exp(own) + c bearing + d) + noise)` of one site's sectors.
 
     Shadowing decays exponentially over distance (M. Gudmundson, Electronics Letters 27 (1991); 3GPP TR

@@ -3,33 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from importlib.metadata import entry_points
-from typing import Any, Generic, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
 
-PLUGINS = "gsparc.terms"  # entry points of installed terms
-KINDS: dict[str, type[Term[Any]]] = {}  # by the name that `stored` gives them
+from gsparc.processes.stored import Stored
+
 Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
 
 
-def name_of(kind: type) -> str:
-    """Return the name that a class is stored by: with its module where that is not ours."""
-    ours = kind.__module__.startswith("gsparc.")
-    return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
-
-
-class Term(ABC, Generic[Rows]):
+class Term(Stored, ABC, Generic[Rows]):
     """One additive part of what is known of values before any row; a prior is a sum of terms.
 
     Numbers of a term may be floats, or tensors with gradients where they are being learned.
     """
-
-    def __init_subclass__(cls, **rest: Any) -> None:
-        super().__init_subclass__(**rest)
-        KINDS[name_of(cls)] = cls
 
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:
@@ -51,15 +39,6 @@ class Term(ABC, Generic[Rows]):
         """Return the term with other parameters (p,), through which gradients flow."""
         return self
 
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `read` needs: its attributes, where these are such."""
-        return dict(vars(self))
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Self:
-        """Return the term whose `state()` this was."""
-        return cls(**state)
-
 
 class Columns(Term[Tensor]):
     """A term of places (n, D) [m] that is linear in weights of unit variance, times the prior's deviation."""
@@ -75,24 +54,3 @@ class Columns(Term[Tensor]):
     def variance(self, a: Tensor) -> Tensor:
         """See `Term`."""
         return self.columns(a).square().sum(-1)
-
-
-def stored(term: Term[Any]) -> dict[str, Any]:
-    """Return what `restored` reads: the name of the term's class, and its state."""
-    return {"term": name_of(type(term)), "state": term.state()}
-
-
-def restored(state: Mapping[str, Any]) -> Any:
-    """Return the term that `stored` wrote.
-
-    Raises:
-        ValueError: nothing that was imported defines a term of this name.
-    """
-    name = str(state["term"])
-    if name not in KINDS:
-        for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
-            if f"{point.module}.{point.attr}" == name:
-                point.load()
-    if name not in KINDS:
-        raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
-    return KINDS[name].read(state["state"])

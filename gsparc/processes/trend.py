@@ -6,13 +6,13 @@ The multi-wall model (COST Action 231, "Digital mobile radio towards future gene
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from gsparc.processes.term import Columns, restored, stored
+from gsparc.processes.stored import Stored
+from gsparc.processes.term import Columns
 
 TINY_M = 1e-6  # distance that has a logarithm
 LEAST_SPREAD = 0.1  # decades: rows at nearly one distance say nothing of a slope that holds far away
@@ -20,7 +20,7 @@ LEVEL = 0.7  # upward part of a floor's normal
 
 
 @dataclass(frozen=True)
-class Law:
+class Law(Stored):
     """`P [dB] = level - 10 exponent log10(max(distance, floor))`.
 
     >>> law = Law(level=-40.0, exponent=2.0, floor=1.0, scale=6.0, place=(0.0, 0.0, 0.0))
@@ -51,17 +51,6 @@ class Law:
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
         return self.level - 10 * self.exponent * self.decades(places)
-
-    def state(self) -> dict[str, Any]:
-        """Return numbers that `read` needs."""
-        return {**vars(self), "place": [*(self.place or ())]}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Self:
-        """Return the law whose `state()` this was."""
-        numbers = {name: float(state[name]) for name in ("level", "exponent", "floor", "scale")}
-        x = [float(value) for value in state["place"]]
-        return cls(**numbers, place=(x[0], x[1], x[2]) if x else None)
 
 
 @dataclass(frozen=True)
@@ -141,15 +130,3 @@ class Trend(Columns):
             # Centred, so that slope and level are nearly independent.
             parts.append((self.law.decades(places)[:, None] - self.middle) / self.spread)
         return torch.cat([*parts, *(term.columns(places) for term in self.more)], 1)
-
-    def state(self) -> dict[str, Any]:
-        """See `Term`."""
-        law = None if self.law is None else self.law.state()
-        numbers = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {**numbers, "law": law, "more": [stored(term) for term in self.more]}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> Self:
-        """See `Term`."""
-        law = None if state["law"] is None else Law.read(state["law"])
-        return cls(**{**state, "law": law, "more": tuple(restored(one) for one in state["more"])})

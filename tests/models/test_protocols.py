@@ -30,7 +30,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, MethodFactory, Reducible, suited_threads
+from gsparc.models.method import Method, MethodFactory, suited_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.per_station import for_stations
@@ -47,15 +47,15 @@ DECLARED = {
     **dict.fromkeys(PEERS, ""),
     "calibrated_raytracer": "",
     "distance_law": "",
-    "gp": "Reducible",
+    "gp": "",
     "complex_gp": "",
     "directional_gp": "HasPaths",
-    "image_source_gp": "HasPaths Reducible",
-    "splat": "Reducible",
-    "array": "Reducible",
-    "moving_array": "Reducible",
-    **dict.fromkeys(("array_process", "image_process", "gsparc"), "Reducible"),  # gsparc of spectra
-    **dict.fromkeys(("image_sources", "channels", "powers", "bearings"), "HasPaths Reducible"),
+    "image_source_gp": "HasPaths",
+    "splat": "",
+    "array": "",
+    "moving_array": "",
+    **dict.fromkeys(("array_process", "image_process", "gsparc"), ""),  # gsparc of spectra
+    **dict.fromkeys(("image_sources", "channels", "powers", "bearings"), "HasPaths"),
 }
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
@@ -70,7 +70,7 @@ SMALL: dict[str, dict[str, Any]] = {
     **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
 }
 UPLINK: dict[str, dict[str, Any]] = {
-    "ridge": {}, "fire": {"steps": 3},
+    "ridge": {}, "fire": {"max_steps": 3},
     "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
 }  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
@@ -157,7 +157,7 @@ def test_a_method_is_what_the_table_says(name, tmp_path):
     method = method_class(name)().made_for(data_of(name, tmp_path))
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in (*PEERS, "image_source_gp", "splat", "gsparc", *NAMED))
+    assert method.resumable == (name in (*PEERS, "fire", "image_source_gp", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
@@ -190,7 +190,7 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
 )
 def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     method, data, fold = fitted(name)
-    assert isinstance(method, Reducible) and set(settings) <= set(method.knobs())
+    assert set(settings) <= set(method.knobs())
     query = ends(method, places(method).float())
     before = method.predict(query)
     less = method.reduced(settings, method.contributions(data, fold.train))

@@ -151,7 +151,7 @@ def rows_and_places(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, flo
     result: dict[str, float] = {}
     for number, name in enumerate(names or [""]):
         ends = places(asked).get("tx"), places(asked).get("rx")
-        place = (predictor.at(name) if name else predictor)._query(*ends).query
+        place = (predictor.at(name) if name else predictor).queries.query(*ends).query
         station = torch.full((len(place),), number) if name else None
         with torch.no_grad():
             told = predictor.method.predict(replace(place, station=station, **known))

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from gsparc.prediction.confidence import process_variance
+from gsparc.processes.averages import mixture
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import EXCESS, Sample, density_given_nearest
-from gsparc.processes.powers import averaged
 
 KERNEL = Kernel.matern((1.2, 6.0), (0.4, 0.6), 0.08)
 
@@ -45,6 +45,6 @@ def test_variance_of_a_mixture_has_what_its_members_disagree_about():
     rng = np.random.default_rng(2)
     share, mean, variance = np.array([0.2, 0.5, 0.3]), rng.normal(size=(3, 4)), rng.uniform(1, 2, (3, 4))
     parts = list(zip(share, torch.from_numpy(mean), torch.from_numpy(variance), strict=True))
-    found = averaged(parts)
+    found = mixture(parts)
     np.testing.assert_allclose(found[0], share @ mean)
     np.testing.assert_allclose(found[1], share @ (variance + mean**2) - (share @ mean) ** 2)

@@ -26,7 +26,7 @@ from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Point, Settings, cost_of_halving, worded
 from gsparc.models.per_station import PerStation
-from gsparc.models.reduced import View, knobs
+from gsparc.models.reduced import View
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import Call, ClockSettings, interleaved
 
@@ -249,7 +249,7 @@ def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]
 
 def irreducible(method: Method) -> list[str]:
     """Return a sentence where there is nothing to weigh against time."""
-    if knobs(method):
+    if method.knobs():
         return []
     why = "it has no Gaussians, sources, components or variances to spare"
     if isinstance(method, PerStation):

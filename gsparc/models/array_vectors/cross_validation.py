@@ -67,13 +67,10 @@ def tune(
         vectors, positions, images = vectors[rows], positions[rows], images[rows]
     pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
     samples = _Samples(
-        images=images[:, pixels].astype(np.float64),
-        matrix=matrix[:, pixels].conj(),
-        background=background[pixels] ** 2,
-        centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
-        gaps=np.array(GAPS) * wavelength,
-        distance=cdist(positions, positions),
-    )
+        images=images[:, pixels].astype(np.float64), matrix=matrix[:, pixels].conj(),
+        background=background[pixels] ** 2, centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
+        gaps=np.array(GAPS) * wavelength, distance=cdist(positions, positions),
+    )  # fmt: skip
     aligned = align(vectors, positions, partner)
 
     def kernel_at(parameters: np.ndarray) -> Kernel:

@@ -7,6 +7,7 @@ import logging
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +24,8 @@ NAMED = 8  # suspect images named in a log line
 
 
 @lru_cache(maxsize=1)
-def _kept(key: str) -> dict[str, np.ndarray]:
-    """What is known of the rows of the data last asked for, to be filled in; seconds of -1: not solved."""
+def _kept(key: str) -> dict[int, tuple[Any, ...]]:
+    """By row of the data last asked for what is known of it: its parts of `Recovered`, and seconds."""
     return {}
 
 
@@ -39,20 +40,18 @@ def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Reco
         rows: (n,) sorted.
         seed: of the random starts.
     """
-    known = _kept(f"{identity(data)} {seed}")
-    missing = rows[known["wall"][rows] < 0] if known else rows
+    known, names = _kept(f"{identity(data)} {seed}"), [one.name for one in fields(Recovered)]
+    missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
         recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)
-        spent = vars(watch.counted)
-        if not known:
-            known.update(_empty(len(data), recovery))
-        for name, values in known.items():
-            values[part] = spent[name] / len(part) if name in spent else getattr(recovery, name)
-    result = Recovered(**{f.name: known[f.name][rows] for f in fields(Recovered)})
-    return result, Spent(*(float(known[f.name][rows].sum()) for f in fields(Spent)))
+        spent = np.tile([*vars(watch.counted).values()], (len(part), 1)) / len(part)
+        parts = zip(*(getattr(recovery, name) for name in names), spent, strict=True)
+        known.update(zip(part.tolist(), parts, strict=True))
+    *columns, seconds = (np.stack(part) for part in zip(*(known[row] for row in rows.tolist()), strict=True))
+    return Recovered(*columns), Spent(*seconds.sum(0).tolist())
 
 
 def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
@@ -76,11 +75,3 @@ def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) 
             "%d spectra do not fit this array (see %s): %s%s",
             len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip
-
-
-def _empty(count: int, like: Recovered) -> dict[str, np.ndarray]:
-    arrays = {f.name: getattr(like, f.name) for f in fields(Recovered)}
-    return {
-        **{k: np.zeros((count, *v.shape[1:]), dtype=v.dtype) for k, v in arrays.items()},
-        **{f.name: np.full(count, -1.0) for f in fields(Spent)},
-    }

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import solved
+from gsparc.processes.nearest import weights_of
 
 SWEEPS = 30
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
@@ -157,9 +157,8 @@ def aligned_to(
     aligned, tree = np.array(vectors, dtype=np.complex128), cKDTree(places)
     near = tree.query(positions, k=np.arange(1, min(NEAREST, len(places)) + 1))[1]
     around = torch.from_numpy(places[near])
-    gram = kernel.between(around, around)
-    gram.diagonal(dim1=-2, dim2=-1).add_(kernel.noise)
-    weights, _ = solved(gram, kernel.between(torch.from_numpy(positions)[:, None], around)[:, 0])
+    noise = torch.full(near.shape, kernel.noise, dtype=torch.float64)
+    weights, _ = weights_of(kernel, torch.from_numpy(positions), around, noise)
     for i, rows in enumerate(near):
         aligned[i] = matched(aligned[i], weights[i].numpy() @ known[rows], partner)
     return aligned

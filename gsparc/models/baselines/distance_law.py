@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.models.target_rows import entry_variance
 from gsparc.processes.powers import Rows
 from gsparc.processes.trend import TINY_M, Law
 from gsparc.processes.worker import stop_when_late
@@ -186,20 +185,16 @@ class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
+    stored = ("law",)
     uses_censored = True
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        return self._learn_censored(positions, targets, np.zeros(len(targets), np.int8))
+        raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
 
-    def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
-    ) -> tuple[str, ...]:
+    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
         assert self.site is not None
-        if self.kind != "rssi":
-            raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
         started = TimeBudget()
-        decibels = to_real(targets, "rssi")[:, 0].astype(np.float64)
-        self.law, notes = law_of(Rows(positions, decibels, side), self.site)
+        self.law, notes = law_of(rows, self.site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
@@ -212,9 +207,3 @@ class DistanceLaw(Differentiable):
         mean = self._decode(self.law.mean(queries)[:, None].to(dtype))
         variance = torch.full((len(queries),), law_variance(self.law), dtype=dtype)
         return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
-
-    def _learned(self) -> dict[str, Any]:
-        return self.law.state()
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        self.law = Law.read(state)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from scipy.linalg import eigh
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
@@ -21,13 +20,13 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
-from gsparc.models.reduced import Filled, MeanOnly, View
-from gsparc.models.target_rows import entry_variance, from_real, rows_of, to_real
+from gsparc.models.reduced import Filled, MeanOnly
+from gsparc.models.target_rows import entry_variance, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering
-from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
+from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 
@@ -116,7 +115,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     """
 
     name = "gp"
-    stored = ("mean", "axes", "lost")
+    stored = ("mean", "axes", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
     count = 0  # type: ignore[assignment]
@@ -131,8 +130,6 @@ class GaussianProcess(Differentiable, ClosedForm):
         self.limit, self.about = components, mean
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        if self.kind == "rssi":
-            return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
         self.powers = None
@@ -167,11 +164,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
-    def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
-    ) -> tuple[str, ...]:
+    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
         assert self.site is not None
-        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), side)
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
@@ -219,51 +213,33 @@ class GaussianProcess(Differentiable, ClosedForm):
         return self._decode(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
+        """See `Method.reduced`."""
         if not isinstance(self.scores, Exact):
             return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return nothing: what a component contributes stands in the process."""
-        return {}
-
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+        """See `Method.reduced`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
             return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
-        count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
-        components: Tensor | slice = slice(
-            None
-        )  # a view: the axes of thousands of images are hundreds of megabytes
-        if count < len(self.axes):
-            components = self.scores.weights.square().sum(0).topk(count).indices
-        mean, axes, shape = self.mean, self.axes[components], self.shape
+        count, lean = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes))), copy.copy(self)
+        # A view where all are kept: the axes of thousands of images are hundreds of megabytes.
+        every, weights = slice(None), self.scores.weights
+        chosen = weights.square().sum(0).topk(count).indices if count < len(self.axes) else every
+        lean.scores, lean.axes = replace(self.scores, weights=weights[:, chosen]), self.axes[chosen]
         if stride > 1:
-            assert grid is not None
-            parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
-            shape = tuple(parts[0].shape)
-            mean, axes = (part.flatten(-2).contiguous() for part in parts)
-        lean = ReducedMean(self, mean, axes, self.scores, components, shape)
-        return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
-
-    def _learned(self) -> dict[str, Any]:
-        if self.powers is not None:
-            return {"powers": self.powers.state()}
-        assert self.scores is not None
-        return {**super()._learned(), "scores": self.scores.state()}
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        self.powers, self.scores = None, None
-        if "powers" in state:
-            self.powers = PowerProcess.read(state["powers"])
-            return
-        super()._relearn(state)
-        self.scores = posterior_of(state["scores"])
+            parts = (
+                part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)
+            )
+            lean.mean, lean.axes = (part.flatten(-2).contiguous() for part in parts)
+            lean.shape = tuple(-(-side // stride) for side in self.shape)
+        lean.seen = len(lean.axes)
+        means = MeanOnly(lean, lean.mean_at)
+        return Filled(means, grid, stride) if stride > 1 and grid is not None else means
 
 
 def projected(
@@ -293,10 +269,7 @@ def kernel_given_nearest(
         seed: of rows that are drawn.
     """
     row = covering(places, LOOKED_AT, seed)
-    near = cKDTree(places).query(places[row], k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))[1]
-    # A row need not come first among its neighbours, as others may lie at its place.
-    own = np.argsort(near == row[:, None], axis=1, kind="stable")[:, : near.shape[1] - 1]
-    rows = np.c_[row, np.take_along_axis(near, own, 1)]
+    rows = with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
@@ -304,46 +277,3 @@ def kernel_given_nearest(
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note
-
-
-class ReducedMean(View):
-    """The mean of a Gaussian process, without its variance.
-
-    Args:
-        inner: fitted.
-        mean, axes: (P,) and (C, P), the basis of targets.
-        scores: what the rows say of components; `components` of them.
-        components: see there.
-        shape: of a target.
-    """
-
-    def __init__(
-        self,
-        inner: GaussianProcess,
-        mean: Tensor,
-        axes: Tensor,
-        scores: Exact,
-        components: Tensor | slice,
-        shape: tuple[int, ...],
-    ) -> None:
-        super().__init__(inner)
-        assert inner.site is not None
-        self._kind, self._site, self._shape = inner.site.kind, inner.site, shape
-        self._mean, self._axes = mean, axes
-        self._weights = scores.weights[:, components].float().contiguous()
-        self._middle = scores.rows.mean(0).float()
-        self._scale = math.sqrt(3) / float(scores.prior.kernel.length)
-        self._places = (scores.rows.float() - self._middle) * self._scale
-
-    @torch.no_grad()
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`; Matern-3/2 in float32."""
-        where = self._site.moving(query.tx, query.rx).expand(len(query), -1)
-        scaled = (where - self._middle) * self._scale
-        far = torch.linalg.vector_norm(scaled[:, None] - self._places, dim=-1)  # cdist: three times slower
-        scores = ((1 + far) * torch.exp(-far)) @ self._weights
-        return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
-
-    def size(self) -> int:
-        """Return the number of components kept."""
-        return len(self._axes)

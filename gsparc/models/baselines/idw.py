@@ -26,6 +26,7 @@ class InverseDistance(Interpolator):
     """
 
     name = "idw"
+    stored = ("positions", "targets")
     NEAR = 1e-6  # [m]; a query on a sample repeats it instead of dividing by zero
 
     def __init__(self, neighbours: int = 8, power: float = 2.0) -> None:
@@ -56,8 +57,6 @@ class InverseDistance(Interpolator):
         unknown = torch.from_numpy(-np.expm1(-distance[:, 0] / self.spacing)).float()
         return Prediction(self._decode(blend), unknown=unknown)
 
-    def _learned(self) -> dict[str, Any]:
-        return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}
-
     def _relearn(self, state: dict[str, Any]) -> None:
-        self._learn(state["positions"].numpy(), state["targets"].numpy())
+        super()._relearn(state)
+        self._learn(self.positions, self.targets)

@@ -13,7 +13,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import from_real, heard, left_out_note, training_targets
+from gsparc.models.target_rows import from_real, heard, left_out_note, rows_of, training_targets
+from gsparc.processes.powers import Rows
+from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -47,13 +49,13 @@ class Interpolator(Method):
         start = TimeBudget()
         # Before learning, which asks for the kind and shape of targets.
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
-        places, targets, side = data.moving[rows], training_targets(data, rows), data.side(rows)
         # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
         before = set(vars(self))
-        if self.uses_censored and side.any():
-            notes = self._learn_censored(places, targets, side)
+        if self.uses_censored and data.site.kind == "rssi":
+            notes = self._learn_powers(rows_of(data, rows))
         else:
-            notes = (*self._learn(places, targets), *left_out_note(data, known))
+            own = self._learn(data.moving[rows], training_targets(data, rows))
+            notes = (*own, *left_out_note(data, known))
         lost = sorted(set(vars(self)) - before - set(self.stored))
         if lost and type(self)._relearn is Interpolator._relearn:
             raise ValueError(
@@ -99,10 +101,8 @@ class Interpolator(Method):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn positions (n, 3) float64 [m] and stored targets (n, ...); return notes for the report."""
 
-    def _learn_censored(
-        self, positions: np.ndarray, targets: np.ndarray, side: np.ndarray
-    ) -> tuple[str, ...]:
-        """The same where targets are levels of rows `side` (n,), see `Measurements.censored`."""
+    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
+        """The same of powers, where it learns from rows of which a level is known too (`uses_censored`)."""
         raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 
     @abstractmethod
@@ -110,12 +110,12 @@ class Interpolator(Method):
         """Predict at (B, 3) float64 [m]."""
 
     def _learned(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.stored}
+        return {name: stored(getattr(self, name, None)) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
         """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
-            setattr(self, name, state[name])
+            setattr(self, name, restored(state[name]))
 
 
 class Differentiable(Interpolator):

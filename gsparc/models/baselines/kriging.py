@@ -23,6 +23,8 @@ from scipy.spatial.distance import cdist, pdist
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.processes.averages import mean_at_places
+from gsparc.processes.stored import Stored
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
 SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels
@@ -37,7 +39,7 @@ JITTER = 1e-9  # of the variance, only so that a system without nugget can be so
 
 
 @dataclass(frozen=True)
-class Variogram:
+class Variogram(Stored):
     """`nugget + sill (1 - exp(-distance / range))` beyond distance 0, where it is 0.
 
     Attributes:
@@ -94,6 +96,7 @@ class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
+    stored = ("positions", "values", "variogram", "channels")
     system: tuple[np.ndarray, np.ndarray] | None = None
     tree: cKDTree | None = None
 
@@ -104,10 +107,11 @@ class Kriging(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Repeated places would make the system singular: their mean is kriged.
-        self.positions, group = np.unique(positions, axis=0, return_inverse=True)
-        decibels, group = self._decibels(targets), group.reshape(-1)
-        self.values = _by_place(decibels, group)
-        self.channels = _by_place(targets.reshape(len(targets), -1), group) if self.kind == "csi" else None
+        decibels, self.channels = self._decibels(targets), None
+        first, self.values, _ = mean_at_places(positions, decibels)
+        self.positions = positions[first]
+        if self.kind == "csi":
+            self.channels = mean_at_places(positions, targets.reshape(len(targets), -1))[1]
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
@@ -195,25 +199,6 @@ class Kriging(Interpolator):
         unknown = (variance / self.variogram.total).clamp(0, 1)
         return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
 
-    def _learned(self) -> dict[str, Any]:
-        v = self.variogram
-        return {
-            "positions": torch.from_numpy(self.positions),
-            "values": torch.from_numpy(self.values),
-            "variogram": [v.nugget, v.sill, v.range],
-            **({} if self.channels is None else {"channels": torch.from_numpy(self.channels)}),
-        }
-
     def _relearn(self, state: dict[str, Any]) -> None:
-        self.positions, self.values = state["positions"].numpy(), state["values"].numpy()
-        self.channels = state["channels"].numpy() if "channels" in state else None
-        self.variogram = Variogram(*(float(v) for v in state["variogram"]))
+        super()._relearn(state)
         self._solve()
-
-
-def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Means (P, D) of rows (n, D) of the same place (n,)."""
-    total = np.zeros((place.max() + 1, rows.shape[1]), np.result_type(rows, np.float64))
-    np.add.at(total, place, rows)
-    mean = total / np.bincount(place)[:, None]
-    return mean.astype(np.complex64 if np.iscomplexobj(rows) else np.float32)

@@ -12,7 +12,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.uplink.interface import UplinkMethod, rms
+from gsparc.models.uplink.interface import UplinkMethod, power, rms
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -45,7 +45,7 @@ class Ridge(UplinkMethod):
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
                 miss = self.predict(batch).mean - batch.target
                 # Mean of logarithms: a few channels in deep fades would decide a mean of ratios.
-                value = float((_power(miss) / _power(batch.target)).log10().mean())
+                value = float((power(miss) / power(batch.target)).log10().mean())
                 if best is None or value < best[0]:
                     best = value, penalty, unit
         assert best is not None
@@ -91,7 +91,3 @@ def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
     level = torch.where(level > 0, penalty * level, 1.0)  # a dead antenna has nothing to solve for
     ridge = level[:, None, None] * torch.eye(gram.shape[1])
     return torch.linalg.solve(gram + ridge, product)
-
-
-def _power(channel: Tensor) -> Tensor:
-    return channel.abs().square().mean((1, 2)).clamp_min(1e-30)

@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
-from gsparc.data.links.stations import numbered
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -27,12 +26,14 @@ from gsparc.models.channels.columns import Group, Slot, aligned, misfit
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
+from gsparc.processes.averages import mean_at_places
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
-from gsparc.processes.posterior import Exact, Posterior, approximated, posterior_of
+from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -128,27 +129,18 @@ class ComplexGP(ClosedForm):
 
         A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
         """
-        targets = torch.from_numpy(take(data.target, known).reshape(len(known), -1))
-        place = torch.from_numpy(numbered(data.moving[known]))
-        _, first, count = np.unique(place.numpy(), return_index=True, return_counts=True)
-        counts = torch.from_numpy(count).double()
-        means, scatter = targets, torch.zeros(len(count), dtype=torch.float64)
-        if len(count) == len(known):  # no copy of what may be gigabytes
-            first = np.arange(len(known))
-        else:
-            means = torch.zeros(len(count), targets.shape[1], dtype=targets.dtype).index_add_(
-                0, place, targets
-            )
-            means /= counts[:, None].float()
-            scatter.index_add_(0, place, targets.abs().square().mean(1).double())
-            scatter = (scatter - counts * means.abs().square().mean(1)).clamp_min(0)
-        values = Values(data.moving[known[first]], means, counts)
+        targets = take(data.target, known).reshape(len(known), -1)
+        first, means, count = mean_at_places(data.moving[known], targets)
+        values = Values(data.moving[known[first]], torch.from_numpy(means), torch.from_numpy(count).double())
+        squares = mean_at_places(data.moving[known], _power(targets))[1]
+        scatter = torch.from_numpy((count * (squares - _power(means))).clip(0))
         near = Neighbourhood.of(values.places, 0)
         row = covering(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
-        sample = torch.from_numpy(values.places[rows]), means[rows][..., entries], counts[rows], scatter[row]
-        kernels = self._kernels(torch.from_numpy(values.places), means)
+        at = torch.from_numpy(values.places)
+        sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
+        kernels = self._kernels(at, values.values)
         kernel = min(kernels, key=lambda one: _density(one, *sample))
         power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
         prior = Prior(replace(kernel, amplitude=power))
@@ -185,17 +177,21 @@ class ComplexGP(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"posterior": self._fitted().state(), **self.runs.state(), "shape": list(self.shape)}
+        return {"posterior": stored(self._fitted()), "runs": stored(self.runs), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.posterior = posterior_of(state["posterior"])
-        self.runs = RunFactors.read(state)
+        self.posterior, self.runs = restored(state["posterior"]), restored(state["runs"])
 
     def size(self) -> int:
         """Return the number of training samples kept."""
         return 0 if self.posterior is None else len(self.posterior.places)
+
+
+def _power(channels: np.ndarray) -> np.ndarray:
+    """Mean square (n,) float64 of channels (n, R)."""
+    return (np.abs(channels) ** 2).mean(1, dtype=np.float64)
 
 
 def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:

@@ -6,7 +6,7 @@ Each group's scale is profiled out. See `gsparc.models.channels.terms.compressed
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -165,18 +165,25 @@ def evidence(parts: tuple[Compressed, ...], prior: ChannelPrior) -> float:
 def fit_powers(
     parts: tuple[Compressed, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
 ) -> tuple[ChannelPrior, float]:
+    """Fit parameters of largest evidence of all `learned` terms; see `fit_terms`."""
+    fitted, nll = fit_terms(parts, learned(prior), shrinkage, steps)
+    return prior.changed(*fitted), nll
+
+
+def fit_terms(
+    parts: Sequence[Compressed], terms: tuple[ChannelTerm, ...], shrinkage: float, steps: int
+) -> tuple[tuple[ChannelTerm, ...], float]:
     """Fit parameters of largest evidence; return its negative logarithm without the priors too.
 
     Args:
-        parts: of the groups.
-        prior: to start from.
+        parts: of the groups, whose designs have these terms' parameters.
+        terms: to start from.
         shrinkage: rows that a prior of directions' powers counts for.
         steps: of L-BFGS at most.
     """
-    terms = learned(prior)
     bounds = [each for term in terms for each in term.bounds()]
     low, high = torch.tensor(bounds, dtype=torch.float64).T
-    begin = parameters(prior).clamp(low, high)
+    begin = torch.cat([term.parameters() for term in terms]).clamp(low, high)
     sizes = [len(term.parameters()) for term in terms]
 
     def penalty(at: Tensor) -> Tensor:
@@ -184,8 +191,9 @@ def fit_powers(
         own = torch.stack([term.penalty(part, shrinkage) for term, part in each]).sum()
         return own + WEAK * (at - begin).square().sum()
 
-    def objective(at: Tensor) -> tuple[float, Tensor]:
-        value = penalty(at.requires_grad_())
+    def told(point: np.ndarray) -> tuple[float, np.ndarray]:
+        at = torch.from_numpy(point).requires_grad_()
+        value = penalty(at)
         (gradient,) = torch.autograd.grad(value, at)
         at, total = at.detach(), float(value.detach())
         for part in parts:
@@ -193,32 +201,15 @@ def fit_powers(
             now = solved(part, own)
             total += now.nll
             gradient = gradient + part.design.T @ slope(part, own, now)
-        return total, gradient
-
-    found, _ = minimised(objective, begin, bounds, steps, SETTLED)
-    fitted = (term.at(own) for term, own in zip(terms, found.split(sizes), strict=True))
-    prior = prior.changed(*fitted)
-    return prior, evidence(parts, prior)
-
-
-def minimised(
-    objective: Callable[[Tensor], tuple[float, Tensor]],
-    start: Tensor,
-    bounds: list[tuple[float, float]],
-    steps: int,
-    settled: float = 1e7 * torch.finfo(torch.float64).eps,  # SciPy's own default of `ftol`
-) -> tuple[Tensor, float]:
-    """Return where L-BFGS finds the least of an objective with its gradient (Q,), and that."""
-
-    def told(at: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = objective(torch.from_numpy(at))
-        return value, gradient.numpy()
+        return total, gradient.numpy()
 
     optimum = minimize(
-        told, start.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, callback=stop_when_late,
-        options={"maxiter": steps, "ftol": settled},
+        told, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, callback=stop_when_late,
+        options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
-    return torch.from_numpy(optimum.x), float(optimum.fun)
+    found = torch.from_numpy(optimum.x)
+    fitted = tuple(term.at(own) for term, own in zip(terms, found.split(sizes), strict=True))
+    return fitted, sum(solved(part, (part.design @ found).exp()).nll for part in parts)
 
 
 def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:

@@ -26,6 +26,7 @@ from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
+from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
@@ -266,17 +267,14 @@ class ChannelField(ClosedForm):
         """See `Method.state`; factors are computed again by `restore`."""
         groups = [each.group for each in self._conditioned()]
         return {
-            "prior": self.prior.state(),
-            "channel": list(self.channel),
-            "rows": torch.from_numpy(self.rows),
-            **self.runs.state(),
-            "groups": [group.state(self.runs.factors) for group in groups],
-        }
+            "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
+            "runs": stored(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
+        }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         antennas, tones = (int(n) for n in state["channel"])
         self.site, self.channel = site, (antennas, tones)
         self.prior, self.rows = ChannelPrior.read(state["prior"]), state["rows"].numpy()
-        runs = RunFactors.read(state)
+        runs = restored(state["runs"])
         self._solve(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)

@@ -336,10 +336,10 @@ class _Search:
         errors = np.zeros(1 + len(DEPTHS))
         for fold in range(FOLDS):
             in_fold = [np.equal(each, fold) for each in number]
-            rest = tuple(
-                without(part, torch.from_numpy(left)) for part, left in zip(parts, in_fold, strict=True)
-            )
-            learned, _ = fit_powers(rest, prior, SHRINKAGE, 2 * SHORT)
+            both = zip(parts, in_fold, strict=True)
+            rest = tuple(without(part, torch.from_numpy(left)) for part, left in both if not left.all())
+            # Of few rows all may be of one fold: then nothing tells powers.
+            learned = fit_powers(rest, prior, SHRINKAGE, 2 * SHORT)[0] if rest else prior
             for part, left in zip(parts, in_fold, strict=True):
                 errors += _left_out(part, learned)[:, left].sum(1) / len(left) / len(parts)
         return errors

@@ -12,12 +12,13 @@ from torch import Tensor
 from gsparc.models.channels.columns import At, Group
 from gsparc.models.channels.terms import KINDS, Noise
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
+from gsparc.processes.stored import Stored
 
 T = TypeVar("T", bound=ChannelTerm)
 
 
 @dataclass(frozen=True)
-class ChannelPrior:
+class ChannelPrior(Stored):
     """Terms, at most one of each kind; isotropic waves and noise are always there."""
 
     terms: tuple[ChannelTerm, ...]
@@ -101,14 +102,3 @@ class ChannelPrior:
         """Return the variance (n,) of the signal."""
         parts = [term.variance(at) for term in self.signals]
         return sum(parts[1:], parts[0])
-
-    def state(self) -> dict[str, Any]:
-        """Return what `read` needs."""
-        return {"frame": vars(self.frame), **{type(term).__name__: term.state() for term in self.terms}}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> ChannelPrior:
-        """Return the prior whose `state()` this was."""
-        frame = Frame(**state["frame"])
-        stored = (kind for kind in KINDS if kind.__name__ in state)
-        return cls(tuple(kind(frame=frame, **state[kind.__name__]) for kind in stored))

@@ -295,7 +295,7 @@ class ImageSourceGP(SourcesInFrame):
         return frame.left_out(self.members[0].rows, predicted)
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
+        """See `Method.knobs`."""
         return ("searches", "keep", "confidence")
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
@@ -307,7 +307,7 @@ class ImageSourceGP(SourcesInFrame):
 
     @torch.no_grad()
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`: `searches` of largest weight, a share of their sources (`keep`), no variance.
+        """See `Method.reduced`: `searches` of largest weight, a share of their sources (`keep`), no variance.
 
         The gains of the remaining sources are fitted anew: one factorisation here, nothing at queries.
         """

@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -26,15 +26,15 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.each_or_together import LearnsTogether
-from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, Reducible
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import comparable, explained
-from gsparc.models.reduced import ReducedByPart
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
+from gsparc.processes.averages import mixture
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -43,7 +43,7 @@ from gsparc.training.time_budget import less_repeatable
 log = logging.getLogger(__name__)
 
 
-class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
+class Mixture(LearnsTogether, ClosedForm):
     """The weighed mean of solutions whose weights follow from the rows: no single one need be the right one.
 
     Initialisers find them, held-out groups weigh them. Subclasses say what is solved for which kind of site.
@@ -234,27 +234,20 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
         if len(result) == 1:
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
-        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        spreads, shares = [], []
-        for weight, one in pairs:
-            assert one.variance is not None and one.unknown is not None
-            # Of a mixture: the mean of variances plus the variance of means (law of total variance).
-            apart = (one.mean - mean).abs().square().flatten(1).mean(1)
-            spreads.append(weight * (one.variance + apart))
-            shares.append(weight * one.unknown)
+        # Members are in closed form, and state both.
+        mean, variance = mixture([(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs])
+        unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
-        variance, unknown = (torch.stack(each).sum(0).to(mean.real.dtype) for each in (spreads, shares))
+        variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
     def left_out(self) -> LeftOutRows:
-        """Return the mean of all."""
+        """Return the mean of all; what they disagree about is part of its variance."""
         result = [member.left_out() for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
-        pairs = list(zip(self.weights, result, strict=True))
-        mean = torch.stack([weight * one.mean for weight, one in pairs]).sum(0)
-        variance = torch.stack([weight * one.variance for weight, one in pairs]).sum(0)
-        return LeftOutRows(result[0].rows, mean, variance)
+        parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]
+        return LeftOutRows(result[0].rows, *mixture(parts))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -282,8 +275,8 @@ class Mixture(LearnsTogether, ReducedByPart, ClosedForm):
 
     @property
     def reducible(self) -> Method | None:
-        """See `ReducedByPart`; what answers faster knows nothing of runs' factors."""
-        return self.only if len(self.runs) == 1 and isinstance(self.only, Reducible) else None
+        """See `Method.reducible`; what answers faster knows nothing of runs' factors."""
+        return self.only if len(self.runs) == 1 else None
 
     def parts(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""

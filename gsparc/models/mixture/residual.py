@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -18,15 +18,14 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Blended, ReducedByPart
+from gsparc.models.reduced import Blended
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import less_repeatable
 
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
-class Residual(ReducedByPart, ClosedForm):
+class Residual(ClosedForm):
     """The sum of a method and a share of a process, conditioned on left-out residuals.
 
     Of several tones or antennas there is no process: one of them is kept of rows left out.
@@ -112,11 +111,11 @@ class Residual(ReducedByPart, ClosedForm):
 
     @property
     def reducible(self) -> Method:
-        """See `ReducedByPart`."""
+        """See `Method.reducible`."""
         return self.method
 
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`; the process stays as it is."""
+    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+        """See `Method.reduced`; the process stays as it is."""
         result, share = super().reduced(settings, measured), self.share
         if self.rest is None:
             return result

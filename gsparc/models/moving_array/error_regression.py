@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 from sklearn.linear_model import RidgeCV
 from torch import Tensor
 
-from gsparc.models.moving_array.power_gp import WithKernel
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, matern32
+from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 16  # whose leave-one-out errors are averaged, and on which variances are conditioned
 NEAR = 4  # the distance to this neighbour is the reach of the average
@@ -41,7 +41,7 @@ def image_features(image: Tensor, added: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ErrorRegression(WithKernel):
+class ErrorRegression(Stored):
     """The regression.
 
     Attributes:

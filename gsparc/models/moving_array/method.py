@@ -21,10 +21,10 @@ from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
-from gsparc.models.moving_array.error_regression import ErrorRegression, fit_errors, image_features
-from gsparc.models.moving_array.power_gp import Trend, TrendSettings, fit_trend
+from gsparc.models.moving_array.error_regression import fit_errors, image_features
+from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import Array, Images, reduced
-from gsparc.models.moving_array.residual import Residual, fit_residual, left_out_error
+from gsparc.models.moving_array.residual import fit_residual, left_out_error
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
     SearchSettings,
@@ -86,18 +86,14 @@ class MovingArrayField(Differentiable, ClosedForm):
     """
 
     effects = "moving_array"
+    stored = ("trends", "exponent", "residual", "positions", "errors")
     takes_budget = True
 
     def __init__(
-        self,
-        search: SearchSettings = SearchSettings(),
-        trend: TrendSettings = TrendSettings(),
-        searches: int = 1,
-        rest_rows: int = 1500,
-        components: int = 512,
-        seed: int = 0,
+        self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
+        searches: int = 1, rest_rows: int = 1500, components: int = 512, seed: int = 0,
         name: str = "moving_array",
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         if searches < 1 or rest_rows < 3:
             raise ValueError(
@@ -106,7 +102,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         self.search, self.trend = search, trend
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name = seed, name
-        self.trends: list[Trend] = []
+        self.trends: list[PowerTrend] = []
         self.rows = np.zeros(0, np.int64)  # that it was conditioned on; none where it was restored
         self._budget = TimeBudget()
 
@@ -131,13 +127,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`; searches where there are several."""
+        """See `Method.reduced`; searches where there are several."""
         own = ("keep", "stride", "confidence")
         return ("searches", *own) if len(self.trends) > 1 else own
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return nothing: the process itself holds what each component contributes."""
-        return {}
 
     reduced = reduced
 
@@ -335,22 +327,13 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _blocks(self, targets: np.ndarray) -> Iterator[Tensor]:
         return (self._images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))
 
-    def _learned(self) -> dict[str, Any]:
-        return {
-            "trends": [trend.state() for trend in self.trends],
-            "exponent": self.exponent,
-            "basis": vars(self.basis),
-            "residual": self.residual.state(),
-            "positions": torch.from_numpy(self.positions),
-            "errors": self.errors.state(),
-        }
-
     def _relearn(self, state: dict[str, Any]) -> None:
+        super()._relearn(state)
         self._lags = self._query = None
-        self.trends = [Trend.from_state(trend) for trend in state["trends"]]
-        self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
-        self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()
-        self.errors = ErrorRegression.from_state(state["errors"])
+        self.trends, self.basis = list(self.trends), Separable(**state["basis"])
+
+    def _learned(self) -> dict[str, Any]:
+        return {**super()._learned(), "basis": vars(self.basis)}
 
 
 def _spread(count: int, limit: int) -> np.ndarray:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 import torch
@@ -15,6 +13,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import Stored
 
 
 @dataclass(frozen=True)
@@ -32,23 +31,8 @@ class TrendSettings:
     rows: int = 600
 
 
-class WithKernel:
-    """A dataclass of tensors and numbers with a kernel among them, stored and read."""
-
-    kernel: Kernel
-
-    def state(self) -> dict[str, Any]:
-        """Return plain tensors and numbers."""
-        return {**vars(self), "kernel": self.kernel.state()}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Self:
-        """Make what had this `state`."""
-        return cls(**{**state, "kernel": Kernel.read(state["kernel"])})
-
-
 @dataclass(frozen=True)
-class Trend(WithKernel):
+class PowerTrend(Stored):
     """The sources of one search and how their powers vary.
 
     Attributes:
@@ -76,10 +60,10 @@ def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, 
 
 def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
-) -> tuple[Trend, np.ndarray]:
+) -> tuple[PowerTrend, np.ndarray]:
     """Return the trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
     weights, residual = solved(kernel, places, torch.from_numpy(power - level))
     # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more
-    trend = Trend(sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous())
+    trend = PowerTrend(sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous())
     return trend, power - residual.numpy()

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.models.in_double import in_double
 from gsparc.models.method import Method, Prediction
-from gsparc.models.moving_array.power_gp import Trend
+from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, mixture
 from gsparc.models.pareto import Settings
@@ -86,8 +86,9 @@ class Images:
     """
 
     def __init__(
-        self, array: Array, basis: Separable, trends: Sequence[Trend], residual: Residual, places: Tensor
-    ) -> None:
+        self, array: Array, basis: Separable, trends: Sequence[PowerTrend], residual: Residual,
+        places: Tensor,
+    ) -> None:  # fmt: skip
         self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
         # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)

@@ -14,15 +14,16 @@ from scipy.linalg import eigh
 from torch import Tensor
 
 from gsparc.models.baselines.gp import choose_kernel
-from gsparc.models.moving_array.power_gp import WithKernel, solved
+from gsparc.models.moving_array.power_gp import solved
 from gsparc.processes.kernel import Kernel
+from gsparc.processes.stored import Stored
 
 KERNEL_COMPONENTS = 128  # principal components that kernels are chosen on
 SPARED = 3e-4  # of the left-out error: energy of predictions along all axes left out
 
 
 @dataclass(frozen=True)
-class Residual(WithKernel):
+class Residual(Stored):
     """The process, conditioned.
 
     Attributes:

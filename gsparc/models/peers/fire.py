@@ -6,33 +6,36 @@ paths, and the decoder evaluates them in the other band. Sizes and training are 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.query import Batch, Query
+from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.peers.trained import perceptron
+from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.models.uplink.interface import UplinkMethod, rms
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
 
 
-class Network(nn.Module):
-    """Complex (B, L) -> complex (B, K) through a Gaussian code."""
+class Coder(Network):
+    """Complex (B, L) -> complex (B, K) through a Gaussian code, the same of all antennas."""
 
-    def __init__(self, inputs: int, outputs: int, hidden: int, code: int) -> None:
-        super().__init__()
+    def __init__(self, scene: Scene, settings: Fire) -> None:
+        super().__init__(scene)
+        assert scene.site.uplink_hz is not None
+        self.antennas = torch.from_numpy(np.asarray(scene.site.antennas))
+        self.weight, self.code = settings.divergence, settings.code
         # Of every number of the code a mean and the logarithm of its variance.
-        self.encoder = perceptron(2 * inputs, 2 * code, hidden, 2, nn.GELU)
-        self.decoder = perceptron(code, 2 * outputs, hidden, 2, nn.GELU)
+        self.encoder = perceptron(2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU)
+        self.decoder = perceptron(self.code, 2 * scene.shape[1], settings.hidden, 2, nn.GELU)
 
-    def forward(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def coded(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
@@ -41,82 +44,58 @@ class Network(nn.Module):
         out = self.decoder(code)
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
 
+    def heard(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
+        """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
+        # Both bands lose alike along the path: the uplink's level carries over to the downlink.
+        scale = rms(uplink)[:, None, None]
+        return uplink[:, self.antennas] / scale, scale
 
-@dataclass(eq=False)
-class Fire(UplinkMethod):
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Return the mean squared error () of unit channels, and the code's divergence by its weight."""
+        assert batch.uplink is not None
+        own, scale = self.heard(batch.uplink)
+        # As many antennas of snapshots as there are snapshots, whatever the array: steps cost alike.
+        pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=draw)
+        # Snapshots have arbitrary phase: rotating both ends augments the data.
+        angle = 2 * math.pi * torch.rand(len(own), 1, generator=draw)
+        turn, noise = (
+            torch.polar(torch.ones_like(angle), angle),
+            torch.randn(len(own), self.code, generator=draw),
+        )
+        guess, divergence = self.coded(own.flatten(0, 1)[pick] * turn, noise)
+        missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
+        return missed.abs().square().mean() + self.weight * divergence.mean()
+
+
+@dataclass(eq=False, kw_only=True)
+class Fire(UplinkMethod, TrainedPeer):
     """One network for all antennas, each snapshot at unit uplink power.
 
     Args:
         hidden: units of each hidden layer.
         code: numbers of the code.
         divergence: weight of the code's divergence.
-        steps, batch, rate: of Adam; the rate falls to zero on a cosine.
-        seed: of everything random.
+        others: see `TrainedPeer`.
     """
 
-    name = "fire"
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0125}
+    makes = Coder
+    name: str = "fire"
     hidden: int = 256
     code: int = 32
     divergence: float = 1e-4
-    steps: int = 4000
-    batch: int = 512
+    batch_size: int = 256
     rate: float = 1e-3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if min(self.hidden, self.code, self.steps, self.batch) < 1:
-            raise ValueError("fire: hidden, code, steps and batch must be at least 1")
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train on all antennas of train and val rows (no choice is made on val)."""
-        started = TimeBudget()
-        self.site = self._need_uplink(data)
-        rows = data.batch(np.concatenate([fold.train, fold.val]))
-        assert rows.uplink is not None
-        # Both bands lose alike along the path: the uplink's level carries over to the downlink.
-        scale = rms(rows.uplink)[:, None, None]
-        x = (self.own(rows.uplink) / scale).flatten(0, 1)
-        y = (rows.target / scale).flatten(0, 1)
-        generator = torch.Generator().manual_seed(self.seed)
-        # Layers draw from torch's global generator, which the caller finds as it was.
-        with torch.random.fork_rng():
-            torch.manual_seed(self.seed)
-            self._sizes = [x.shape[1], y.shape[1], self.hidden, self.code]
-            self.network = Network(*self._sizes)
-        optimizer = torch.optim.Adam(self.network.parameters(), lr=self.rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
-        for _ in range(self.steps):
-            pick = torch.randint(len(x), (self.batch,), generator=generator)
-            noise = torch.randn(self.batch, self.code, generator=generator)
-            # Snapshots have arbitrary phase: rotating both ends augments the data.
-            angle = 6.2832 * torch.rand(self.batch, 1, generator=generator)
-            turn = torch.polar(torch.ones_like(angle), angle)
-            guess, divergence = self.network(x[pick] * turn, noise)
-            loss = (guess - y[pick] * turn).abs().square().mean() + self.divergence * divergence.mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-        self.network.eval().requires_grad_(False)
-        return FitReport(started.spent)
+        """See `TrainedPeer.fit`; on all antennas."""
+        self._need_uplink(data)
+        return super().fit(data, fold, context)
 
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
-        uplink = self.heard(query)
-        scale = rms(uplink)[:, None, None]
-        own = self.own(uplink) / scale
-        guess = self.network(own.flatten(0, 1))[0]
-        return Prediction(guess.view(*own.shape[:2], -1) * scale)
-
-    def state(self) -> dict[str, Any]:
-        """See `Method.state`."""
-        return {"sizes": self._sizes, "network": dict(self.network.state_dict())}
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site = site
-        self._sizes = list(state["sizes"])
-        self.network = Network(*self._sizes)
-        self.network.load_state_dict(state["network"])
-        self.network.eval().requires_grad_(False)
+        network, uplink = self.fitted(), self.heard(query)
+        assert isinstance(network, Coder)
+        own, scale = network.heard(uplink)
+        return Prediction(network.coded(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale)

@@ -83,12 +83,9 @@ def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
 
 
 def render_each(
-    geometry: tuple[Tensor, Tensor, Tensor, Tensor],
-    features: Tensor,
-    pose: Pose,
-    grid: SphereGrid,
+    geometry: tuple[Tensor, Tensor, Tensor, Tensor], features: Tensor, pose: Pose, grid: SphereGrid,
     **options: Any,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return images of samples with different Gaussians each, one plan per sample.
 
     Args:

@@ -49,11 +49,9 @@ class DeformedGaussians(GaussianNetwork):
         field = self.field
         place, turn, stretch, fade, light = self._changes(tx, rx)
         geometry = (
-            field.means + SHIFT * place,
-            field.quats + turn,
-            (field.log_scales + stretch.clamp(-3, 3)).exp(),
+            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch.clamp(-3, 3)).exp(),
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
-        )
+        )  # fmt: skip
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
         return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)
 

@@ -33,6 +33,7 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximated
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
@@ -203,22 +204,21 @@ class PowerField(ClosedForm):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "priors": [{**prior.state(), "share": share} for share, prior in self.priors],
+            "priors": stored(self.priors),
             "seed": self.seed,
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
             **({} if self.fringes is None else {"fringes": self.fringes.state()}),
-            **({} if self.powers is None else {"process": self.powers.state()}),
+            "process": stored(self.powers),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.seed = site, int(state["seed"])
-        self.priors = tuple((float(one["share"]), Prior.read(one)) for one in state["priors"])
+        self.priors, self.powers = restored(state["priors"]), restored(state["process"])
         self.fringes = fringes_of(state["fringes"]) if "fringes" in state else None
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
-        self.powers = PowerProcess.read(state["process"]) if "process" in state else None
 
     def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
         """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from gsparc.processes.posterior import Exact
-from gsparc.processes.term import Columns, restored, stored
+from gsparc.processes.term import Columns
 
 
 @dataclass(frozen=True)
@@ -35,15 +34,6 @@ class InWorld(Columns):
             name, shape = type(self.term).__name__, (*result.shape,)
             raise ValueError(f"{name}.columns gave {shape}; ({len(places)}, Q) finite numbers are needed")
         return result
-
-    def state(self) -> dict[str, Any]:
-        """See `Term`."""
-        return {"term": stored(self.term), "origin": self.origin}
-
-    @classmethod
-    def read(cls, state: dict[str, Any]) -> InWorld:
-        """See `Term`."""
-        return cls(restored(state["term"]), state["origin"])
 
 
 def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:

@@ -135,7 +135,7 @@ class ImageProcess(LearnedField):
         return None if process_only else super().gradient_problem()
 
     def reduced(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
-        """See `Reducible`."""
+        """See `Method.reduced`."""
         twin = copy.copy(self)
         twin._average = None
         result = LearnedField.reduced(twin, settings, measured)

@@ -45,6 +45,7 @@ from gsparc.models.splat.auto_settings import Choices, resolve, settled
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.models.splat.closed_form_start import prepare
 from gsparc.ops import Pose
+from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
 
@@ -148,7 +149,7 @@ class LearnedField(Method):
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.steps_taken = int(marks.get("taken", 0))
         self.spent, self._apart = {}, _apart(data, fold)
-        self._left_out = LeftOut.of(marks.get("left_out"))  # an interrupted run's start is not repeated
+        self._left_out = restored(marks.get("left_out"))  # an interrupted run's start is not repeated
         self._billed, self._limited_by = Spent(), marks.get("limited_by")
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
@@ -270,7 +271,7 @@ class LearnedField(Method):
             "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
             "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
-            "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
+            "left_out": stored(self._left_out), **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         watch: list[L.Callback] = []
@@ -420,7 +421,7 @@ class LearnedField(Method):
     # -- what it can do besides ----------------------------------------------------------------------
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`."""
+        """See `Method.reduced`."""
         return reduce.knobs(self.fitted())
 
     contributions = reduce.contributions

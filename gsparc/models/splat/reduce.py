@@ -37,7 +37,7 @@ def through_array(model: GaussianModel) -> bool:
 
 
 def knobs(model: GaussianModel) -> tuple[str, ...]:
-    """See `Reducible`.
+    """See `Method.reduced`.
 
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, which `keep` is a share of, and pixels.

@@ -26,9 +26,14 @@ class SeparatesPaths(Protocol):
         """Return channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
 
+def power(channels: Tensor) -> Tensor:
+    """Return the mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
+    return channels.abs().square().mean((1, 2)).clamp_min(1e-30)
+
+
 def rms(channels: Tensor) -> Tensor:
-    """Return the root mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
-    return channels.abs().square().mean((1, 2)).sqrt().clamp_min(1e-30)
+    """Return the root of the same."""
+    return power(channels).sqrt()
 
 
 class UplinkMethod(Method):

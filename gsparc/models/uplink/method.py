@@ -15,7 +15,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
 from gsparc.models.uplink.error_model import RelativeErrorRegression, SearchResult, estimate_noise
-from gsparc.models.uplink.interface import UplinkMethod
+from gsparc.models.uplink.interface import UplinkMethod, power
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
 from gsparc.physics.waves import LIGHT
@@ -43,12 +43,9 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self,
-        search: SearchSettings = SearchSettings(),
-        teachers: int = 1200,
-        shrink: bool = True,
+        self, search: SearchSettings = SearchSettings(), teachers: int = 1200, shrink: bool = True,
         seed: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
         self.settings, self.teachers = search, teachers
@@ -99,7 +96,7 @@ class UplinkField(UplinkMethod):
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
-                error.append(_power(mean - true) / _power(true).clamp_min(1e-30))
+                error.append(power(mean - true) / power(true))
                 features.append(result.features(mean, aperture))
         return torch.cat(features), torch.cat(error)
 
@@ -127,7 +124,7 @@ class UplinkField(UplinkMethod):
             error = self.error_model.expected(result.features(mean, aperture))
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
-            variance = error * _power(mean)
+            variance = error * power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
         return Prediction(mean, variance, error / (1 + error))
 
@@ -174,7 +171,3 @@ class UplinkField(UplinkMethod):
     def size(self) -> int:
         """Return the number of sources of a snapshot."""
         return self.settings.rounds * self.settings.picks
-
-
-def _power(channel: Tensor) -> Tensor:
-    return channel.abs().square().mean((1, 2))

@@ -187,13 +187,9 @@ class SourceSearch:
         gains = (fit.gain * scale[:, None]).repeat(1, 3)
         spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
         return Sources(
-            direction,
-            delay,
-            fit.gain * scale[:, None],
-            fit.inverse * (noise * scale**2)[:, None, None],
-            spread * (noise / 2)[:, None, None],
-            -(fit.gain_slopes.mH * gains[:, None]),
-        )
+            direction, delay, fit.gain * scale[:, None], fit.inverse * (noise * scale**2)[:, None, None],
+            spread * (noise / 2)[:, None, None], -(fit.gain_slopes.mH * gains[:, None]),
+        )  # fmt: skip
 
     def _reach(self, count: int) -> Tensor:
         """Standard deviations (3 N,) of a step before anything is known."""

@@ -5,21 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
-import numpy as np
 import torch
 
 from gsparc.ops.projection import Projection
 from gsparc.prediction.bench import kernels, layers
 from gsparc.prediction.bench.measure import Call, Case, Machine, measure, timed, undisturbed
-from gsparc.prediction.bench.scene import NETWORK, Scene, scene
+from gsparc.prediction.bench.scene import NETWORK, scene
 from gsparc.prediction.timing import ClockSettings
 
 log = logging.getLogger(__name__)
 
 MOVING = (kernels.plan, kernels.moving, kernels.weights)  # a batch is as many plans
-RASTERIZER = (*MOVING[:2], kernels.static, kernels.frozen, kernels.backward, kernels.weights)
+RASTERIZER = (*MOVING[:2], kernels.frozen, kernels.backward, kernels.weights)
 MOST_PLANNED = 1_000_000  # Gaussians times poses in one call
 # Of forward / limit: for fewer Gaussians than MANY, and for more. Where it comes from: docs/kernels.md.
 FORWARD: dict[Projection, tuple[float, float]] = {"tangent": (4.0, 5.0), "equirect": (3.0, 4.0)}
@@ -74,12 +72,7 @@ class Claim:
 
 @torch.no_grad()
 def claims(
-    projection: Projection,
-    counts: Sequence[int],
-    threads: int,
-    batch: int,
-    machine: Machine,
-    clock: ClockSettings,
+    projection: Projection, counts: Sequence[int], threads: int, machine: Machine, clock: ClockSettings
 ) -> list[Claim]:
     """Measure every promise for one projection; `counts` ascending, the middle one of static receivers."""
     before = torch.get_num_threads()
@@ -93,18 +86,11 @@ def claims(
         for field in fields[1:]:
             bound = FORWARD[projection][len(field) > MANY]
             results.append(_limit("forward / limit", kernels.moving(field, 1), bound, machine, clock))
-        queries = {"moving": kernels.moving(middle, 1), "one": kernels.frozen(middle, 1)}
-        queries["many"] = kernels.frozen(middle, batch)
-        times = _times({name: _whole(case) for name, case in queries.items()}, clock)
-        # A batch answers as many queries as it has samples.
-        each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
-        results.append(Claim(f"moving / frozen at {size}", each, 3.0, True))
-        results.append(Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True))
+        times = _times({"moving": kernels.moving(middle, 1), "frozen": kernels.frozen(middle, 1)}, clock)
+        results.append(Claim(f"moving / frozen at {size}", times["moving"] / times["frozen"], 3.0, True))
         for field in fields[1:]:
             results.append(_limit("frozen / bytes", kernels.frozen(field, 1), FROZEN, machine, clock))
-        one, many = (_whole(layers.channel(middle, *shape)) for shape in ((1, 1), layers.MANY))
-        results.append(Claim(f"1664 channels / 1 at {size}", _ratio(many, one, clock), 2.0))
-        return [*results, *_growth(fields, clock), _learning(projection)]
+        return [*results, _learning(projection)]
     finally:
         torch.set_num_threads(before)
 
@@ -122,28 +108,12 @@ def _learning(projection: Projection) -> Claim:
     return Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)
 
 
-def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
-    """Time per doubling of N between neighbouring sizes."""
-    calls = {str(len(field)): kernels.moving(field, 1).kernel for field in fields}
-    times = _times(calls, clock)
-    results = []
-    for small, large in pairwise(fields):
-        doublings = np.log2(len(large) / len(small))
-        # Sizes need not be powers of two apart: the ratio is reduced to one doubling.
-        growth = (times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
-        results.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
-    return results
-
-
-def _whole(case: Case) -> Call:
-    assert case.whole is not None
-    return case.whole
-
-
 def _ratio(above: Call, below: Call, clock: ClockSettings) -> float:
-    times = _times({"above": above, "below": below}, clock)
-    return times["above"] / times["below"]
+    times = timed({"above": above, "below": below}, clock)
+    return undisturbed(times["above"]) / undisturbed(times["below"])
 
 
-def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, float]:
-    return {name: undisturbed(values) for name, values in timed(calls, clock).items()}
+def _times(cases: dict[str, Case], clock: ClockSettings) -> dict[str, float]:
+    """Whole queries, from positions to predictions."""
+    times = timed({name: case.whole for name, case in cases.items()}, clock)
+    return {name: undisturbed(values) for name, values in times.items()}

@@ -27,11 +27,9 @@ def moving(scene: Scene, batch: int) -> Case:
 
     return Case(
         *("forward, moving receiver", scene.projection, len(scene), batch),
-        work=_blending(scene, poses, batch * COMPLEX),
-        kernel=draw,
-        whole=lambda: scene.model(tx, poses),
+        work=_blending(scene, poses, batch * COMPLEX), kernel=draw, whole=lambda: scene.model(tx, poses),
         **_reference(scene, batch, lambda: draw("reference")),
-    )
+    )  # fmt: skip
 
 
 def plan(scene: Scene, batch: int) -> Case:
@@ -44,28 +42,6 @@ def plan(scene: Scene, batch: int) -> Case:
         kernel=lambda: scene.plan(poses),
         whole=lambda: scene.model.plan(poses),
         **_reference(scene, batch, lambda: scene.plan(poses, backend="reference")),
-    )
-
-
-def static(scene: Scene, batch: int) -> Case:
-    """Time a static receiver's plan made once: blend (kernel); emission too (whole)."""
-    pose = receiver()
-    layout = scene.plan(pose)
-    features = scene.features.expand(batch, -1, -1).contiguous()
-    tx = places(batch) + 1
-
-    def whole() -> Tensor:
-        values = scene.model.features(tx, pose if batch == 1 else Pose.identity(places(batch)))
-        return composite(layout, *scene.geometry, values).image
-
-    # The view of a static receiver is one, whatever the batch: so is the dense plan.
-    dense = scene.plan(pose, backend="reference") if _dense_bytes(scene, 1) <= REFERENCE_BYTES else None
-    return Case(
-        *("forward, static receiver", scene.projection, len(scene), batch),
-        work=_blending(scene, pose, batch * COMPLEX),
-        kernel=lambda: composite(layout, *scene.geometry, features).image,
-        whole=whole,
-        **_reference(scene, 1, lambda: dense and composite(dense, *scene.geometry, features).image),
     )
 
 

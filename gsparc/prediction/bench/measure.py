@@ -144,12 +144,10 @@ def measure(
     # The roofline: at best memory and arithmetic overlap, and the slower one is the limit.
     limit = max(by_bytes, by_pairs)
     return Row(
-        *(case, threads, times["kernel"], times.get("whole")),
-        limit=limit,
-        over=undisturbed(times["kernel"]) / limit,
-        bound="pairs" if by_pairs > by_bytes else "bytes",
+        *(case, threads, times["kernel"], times.get("whole")), limit=limit,
+        over=undisturbed(times["kernel"]) / limit, bound="pairs" if by_pairs > by_bytes else "bytes",
         reference=None if reference is None else float(np.median(reference)),
-    )
+    )  # fmt: skip
 
 
 def facts(row: Row) -> dict[str, float | str | None]:

@@ -73,11 +73,9 @@ def scene(
         # By its size, so that a scene is the same whichever were made before it.
         torch.manual_seed(count)
         settings = ModelSettings(
-            FieldSettings(count=count, placement="uniform", margin=0.0),
-            emission,
-            AttenuationSettings(inverse_distance=True),
-            raster=RasterSettings(projection, backend=backend),
-        )
+            FieldSettings(count=count, placement="uniform", margin=0.0), emission,
+            AttenuationSettings(inverse_distance=True), raster=RasterSettings(projection, backend=backend),
+        )  # fmt: skip
         model = ComplexSpectra(settings, _site())
         _scatter(model.gaussians)
         features = torch.rand(count, COMPLEX)
@@ -112,15 +110,6 @@ def _scatter(field: GaussianField) -> None:
 
 def _site() -> Site:
     return Site(
-        name="bench",
-        kind="spectrum",
-        static_end="tx",
-        grid=GRID,
-        array=None,
-        carrier_hz=None,
-        subcarriers_hz=None,
-        origin=np.zeros(3),
-        box=ROOM,
-        moving_box=ROOM,
-        sha256="",
-    )
+        name="bench", kind="spectrum", static_end="tx", grid=GRID, array=None, carrier_hz=None,
+        subcarriers_hz=None, origin=np.zeros(3), box=ROOM, moving_box=ROOM, sha256="",
+    )  # fmt: skip

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import zlib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -116,6 +117,13 @@ def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
     assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
     assert checksum == zlib.crc32(blob[CHECKED:])
+
+
+def test_more_members_than_the_library_holds_were_packed():
+    process = of_powers(60).method.powers
+    for count, packs in ((7, True), (8, False)):
+        many = replace(process, others=((0.1, replace(process, others=())),) * count)
+        assert (make.powers_form(many, 1.0) is not None) == packs
 
 
 def test_trees_hold_every_row_and_boxes_those_below():

@@ -307,6 +307,15 @@ def test_an_array_that_stands_still_and_one_that_moves():
         assert answer_error(field, data, np.arange(50, 80)) < 0.01, name
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_channels_of_two_rows_were_divided_by_no_row(count):
+    """All were of one fold, without which powers of directions are found."""
+    data = _sent(12)
+    field, rows = ChannelField(), np.arange(count)
+    field.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+    assert torch.isfinite(torch.view_as_real(field.predict(data.batch(np.arange(12))).mean)).all()
+
+
 def test_tones_far_apart_are_bands_of_their_own():
     tones = 2.4e9 + 1e6 * np.arange(40)
     found = bands(tones, 10.0)

@@ -1,13 +1,16 @@
 """The plain process as one of the solutions that are weigh_candidates."""
 
 import numpy as np
+import torch
 from boxes import room_of_spectra
 from closed import fitted_to
 
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.mixture.fit_candidates import weigh_candidates
+from gsparc.models.mixture.methods import Channels
 
 
 def test_sources_of_few_rows_lost_a_decibel_to_the_process():
@@ -20,3 +23,23 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_inside(data, fold, None, 3, 0)
     assert [*weigh_candidates({"bearings": spoilt, "process": good}, data, fold, cut)] == ["process"]
+
+
+class Said(ClosedForm):
+    """A member whose rows left out are all of one value."""
+
+    fit = predict = state = restore = lambda *unused: None
+
+    def __init__(self, level: float) -> None:
+        self.level = level
+
+    def left_out(self) -> LeftOutRows:
+        return LeftOutRows(np.arange(3), torch.full((3, 1, 2), self.level), torch.ones(3))
+
+
+def test_what_members_disagree_about_was_in_no_left_out_variance():
+    """It is in that of predictions: weights and places were judged by variances that were too small."""
+    both = Channels()
+    both.members, both.weights = [Said(1.0), Said(3.0)], (0.5, 0.5)
+    left = both.left_out()
+    assert (left.mean == 2).all() and (left.variance == 2).all(), "1 of each, and 1 between them"

@@ -15,7 +15,7 @@ import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
-from gsparc.processes import term, trend
+from gsparc.processes import stored, term, trend
 
 FILE = Path(__file__).parents[3] / "examples" / "own-term" / "trees.py"
 STILL = [300.0, -100.0, 20.0]  # far from the origin of local coordinates
@@ -29,7 +29,7 @@ def trees(monkeypatch):
     monkeypatch.setitem(sys.modules, "trees", module)
     spec.loader.exec_module(module)
     yield module.Trees
-    term.KINDS.pop("trees.Trees", None)
+    stored.KINDS.pop("trees.Trees", None)
 
 
 def town(count: int = 160) -> dict[str, np.ndarray]:
@@ -60,7 +60,7 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
     errors = [np.std(one.rssi(rx=asked)[:, 0] - truth) for one in (own, plain)]
     assert errors[0] < 0.9 * errors[1], errors
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), own.rssi(rx=asked), atol=1e-5)
-    term.KINDS.pop("trees.Trees")
+    stored.KINDS.pop("trees.Trees")
     with pytest.raises(CheckpointError, match=r"no term is called 'trees\.Trees': import the file"):
         gsparc.load(path)
 
@@ -88,8 +88,8 @@ def test_a_term_may_have_the_name_of_one_of_ours():
             return places[:, :1]
 
     wall = trend.Walls(torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1, 2), torch.zeros(3))
-    assert isinstance(term.restored(term.stored(wall)), trend.Walls)
-    assert isinstance(term.restored(term.stored(Walls())), Walls)
+    assert isinstance(stored.restored(stored.stored(wall)), trend.Walls)
+    assert isinstance(stored.restored(stored.stored(Walls())), Walls)
 
 
 def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):

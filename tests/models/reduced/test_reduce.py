@@ -40,7 +40,7 @@ class Case(NamedTuple):
 
     @classmethod
     def of(cls, method: Method, data: Measurements, fold: Fold) -> Case:
-        return cls(method, data, fold, reduced.contributions(method, data, fold.train))
+        return cls(method, data, fold, method.contributions(data, fold.train))
 
     @classmethod
     def fit(cls, method: Method, data: Measurements, share: int = 4) -> Case:
@@ -125,7 +125,7 @@ def through_array(tmp_path_factory) -> Case:
 
 def test_fewer_places_say_what_all_of_them_said(through_array):
     case = through_array
-    assert reduced.knobs(case.method) == ("keep", "stride", "confidence")
+    assert case.method.knobs() == ("keep", "stride", "confidence")
     ways = [case.less(keep=share) for share in (1.0, 0.75, 0.1)]
     assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
     assert case.method.fitted().emission.encoding.width == 36
@@ -171,10 +171,10 @@ def crossings() -> Case:
 
 def test_one_search_is_not_swept_as_two(crossings, monkeypatch):
     method, trends = crossings.method, crossings.method.trends
-    assert ("searches" in reduced.knobs(method)) == (len(trends) > 1)
+    assert ("searches" in method.knobs()) == (len(trends) > 1)
     for count in (1, 2):
         monkeypatch.setattr(method, "trends", trends[:1] * count)
-        assert ("searches" in reduced.knobs(method)) == (count > 1)
+        assert ("searches" in method.knobs()) == (count > 1)
 
 
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
@@ -221,6 +221,7 @@ def test_what_a_process_beside_adds_stays(field):
     both = own_copy(field)
     plain = both.answer(both.less(stride=2)).mean
     beside = SimpleNamespace(predict=lambda query: SimpleNamespace(mean=torch.ones_like(plain)))
+    beside.reduced = lambda *settings: beside
     both.method._average = (beside, 0.25)
     assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 

@@ -106,7 +106,8 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(hidden=16, code=4, steps=20, batch=16)]
+    "make",
+    [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(max_steps=20)],
 )
 def test_peers_answer_and_keep(make, tmp_path) -> None:
     data = city()

@@ -31,7 +31,9 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
         weights, alone = zip(*process.members, strict=True)
         files = [packed(form, np.zeros(3)) for one in alone if (form := powers_form(one, scale))]
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
-        return Form(5, [len(weights), *weights], named) if len(files) == len(weights) else None
+        # As many as `kMost` of ops/csrc/field/mixture.h.
+        fits = len(files) == len(weights) <= LANES
+        return Form(5, [len(weights), *weights], named) if fits else None
     posterior, kernel, trend = process.posterior, process.kernel, process.trend
     if (signed := kernel.compiled) is None or trend.more:
         return None

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import At, Slot
 from gsparc.models.channels.terms.compressed import Basis, Dense, Piece
+from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
 
 LOWEST, HIGHEST = -14.0, 7.0  # logarithms of powers
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Stored):
     """What all terms of a field share.
 
     Attributes:
@@ -93,7 +94,3 @@ class ChannelTerm(Term[At]):
     def worth(self) -> int:
         """Numbers that are learned for it."""
         return len(self.parameters())
-
-    def state(self) -> dict[str, Any]:
-        """Return what makes it again in a frame, see `Term`."""
-        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "frame"}

@@ -1,0 +1,63 @@
+"""Predictions that autograd and `torch.func` follow by the position of what moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.models.method import Method, Prediction, suited_threads
+from gsparc.ops import Pose
+from gsparc.ops.transforms import carries_tangent, mapped, transforming
+from gsparc.prediction.query import Queries
+
+
+def followed(
+    method: Method, queries: Queries, tx: Any, rx: Any, prepared: list[Method]
+) -> tuple[Prediction, torch.dtype, bool]:
+    """Return moments in stored units, in float64, the precision of the positions, and whether one was given.
+
+    Args:
+        method: that answers.
+        queries: of its site.
+        tx, rx: as a `Predictor` is asked, what moves as tensors.
+        prepared: methods whose caches were filled outside of transforms; `method` is added.
+
+    Raises:
+        ValueError: the method has no gradients, or positions that nothing follows.
+    """
+    problem, site = method.gradient_problem(), queries.site
+    if problem is not None:
+        raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
+    ends, fixed = {"tx": tx, "rx": rx}, []
+    if isinstance(rx, Pose):
+        # Gradients are by the position of a pose; its rotation must not ask for one.
+        ends["rx"], fixed = rx.position, [rx.rotation]
+    if site.static_end is not None:
+        fixed.append(ends.pop(site.static_end))
+    for end, value in ends.items():
+        if value is not None and not isinstance(value, Tensor):
+            raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
+    if mapped(*ends.values()):
+        raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
+    if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
+        raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
+    query, single, _ = queries.query(tx, rx, torch.float64)
+    origin = torch.from_numpy(np.asarray(site.origin, np.float64))
+    # The origin goes in float64: in UTM coordinates float32 has no centimetres.
+    local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
+    at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
+    with suited_threads(method, len(query)):
+        if transforming() and method not in prepared:  # what it keeps must not be a transform's
+            prepared.append(method)
+            with torch._C._DisableFuncTorch(), torch.no_grad():
+                method.predict(query)
+        moments = method.predict(replace(query, tx=local.get("tx", query.tx), rx=at))
+    dtype = torch.float32
+    for value in ends.values():
+        # Computed in float64, answered as precisely as the positions were given.
+        dtype = torch.promote_types(dtype, value.dtype)
+    return moments, dtype, single

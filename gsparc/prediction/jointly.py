@@ -1,0 +1,61 @@
+"""Levels of several places or stations together, with the covariance of their errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Site
+from gsparc.models.method import HasProcess, Method
+from gsparc.models.per_station import OfStation, PerStation
+from gsparc.prediction.query import Queries
+
+
+class Jointly:
+    """What a `Predictor` of powers says of several places or stations at once."""
+
+    site: Site
+    method: Method
+    queries: Queries
+
+    def joint(self, places: Any, stations: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return levels (G, k) of measurements, covariances (G, k, k) and noise (k,), float64.
+
+        Levels are in decibels of `site.level_unit`, the rest [dB^2]. None: nothing is known of how levels of
+        stations go together.
+
+        Args:
+            places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
+            stations: (k,) numbers.
+        """
+        every = self.method.every() if isinstance(self.method, PerStation) else None
+        if every is None or (known := every.joint()) is None:
+            return None
+        moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
+        if moving.dim() == 2:
+            moving = moving[:, None].expand(-1, len(stations), 3)
+        level, covariance, noise = (part.numpy() for part in known.joint(moving, torch.as_tensor(stations)))
+        return level + 10 * np.log10(self.site.target_scale), covariance, noise
+
+    def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float] | None:
+        """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].
+
+        Of several stations of one of them, see `Predictor.at`. None: the model states none.
+
+        >>> covariance, noise = predictor.covariance(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
+        >>> covariance.shape, bool(covariance[0, 1] < covariance[0, 0]), noise > 0
+        ((2, 2), True, True)
+        """
+        places = self.queries.query(tx, rx, torch.float64).query.places(self.site)
+        known = self.method.joint() if isinstance(self.method, OfStation) else None
+        if isinstance(self.method, OfStation) and known is not None:
+            station = torch.full((len(places),), self.method.number)
+            _, covariance, noise = known.joint(places[None], station)
+            return (covariance[0] - noise.diag()).numpy(), float(noise[0])
+        process = self.method.process() if isinstance(self.method, HasProcess) else None
+        if process is None:
+            return None
+        covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]
+        return covariance.numpy(), process.kernel.amplitude * process.kernel.noise

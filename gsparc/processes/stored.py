@@ -1,0 +1,76 @@
+"""Objects as the plain containers that checkpoints hold, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from importlib.metadata import entry_points
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+PLUGINS = "gsparc.terms"  # entry points of installed kinds
+KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
+
+
+def name_of(kind: type) -> str:
+    """Return the name that a class is stored by: with its module where that is not ours."""
+    ours = kind.__module__.startswith("gsparc.")
+    return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
+
+
+class Stored:
+    """A kind of objects that checkpoints hold, told by its class's name.
+
+    Attributes may be numbers, strings, tensors, NumPy arrays, None, tuples, mappings, and such objects.
+    """
+
+    def __init_subclass__(cls, **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        KINDS[name_of(cls)] = cls
+
+    def state(self) -> dict[str, Any]:
+        """Return what `read` needs: the fields of a dataclass, else all attributes."""
+        names = [one.name for one in fields(self)] if is_dataclass(self) else vars(self)
+        return {name: stored(getattr(self, name)) for name in names}
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Self:
+        """Return the object whose `state()` this was."""
+        return cls(**{name: restored(part) for name, part in state.items()})
+
+
+def stored(part: Any) -> Any:
+    """Return what `restored` reads.
+
+    >>> stored((1.0, None, np.zeros(2)))
+    [1.0, None, {'array': tensor([0., 0.], dtype=torch.float64)}]
+    """
+    if isinstance(part, Stored):
+        return {"kind": name_of(type(part)), "state": part.state()}
+    if isinstance(part, np.ndarray):
+        return {"array": torch.from_numpy(part)}
+    return [stored(each) for each in part] if isinstance(part, (tuple, list)) else part
+
+
+def restored(part: Any) -> Any:
+    """Return what `stored` was given; lists as tuples.
+
+    Raises:
+        ValueError: nothing that was imported defines a kind of this name.
+    """
+    if isinstance(part, list):
+        return tuple(restored(each) for each in part)
+    if not isinstance(part, Mapping) or part.keys() not in ({"kind", "state"}, {"array"}):
+        return part
+    if "array" in part:
+        return part["array"].numpy()
+    name = str(part["kind"])
+    if name not in KINDS:
+        for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
+            if f"{point.module}.{point.attr}" == name:
+                point.load()
+    if name not in KINDS:
+        raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
+    return KINDS[name].read(part["state"])
