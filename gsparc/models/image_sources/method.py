@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -20,14 +21,21 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
-from gsparc.models.image_sources.ensemble import Look, at_noise_floor, raced, refined, search_many, weights_of
+from gsparc.models.image_sources.ensemble import (
+    Look,
+    Start,
+    at_noise_floor,
+    refined,
+    search_many,
+    weights_of,
+)
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
 from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
@@ -36,6 +44,7 @@ from gsparc.models.reduced import MeanOnly
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.race import Race
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
@@ -52,6 +61,7 @@ class ImageSourceGP(SourcesInFrame):
     Args:
         budget_s: as `FitContext.budget_s`, where that says nothing [s].
         searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see `SearchSettings`.
+        start: places [m], local, and amplitudes of sources that a search of these measurements starts from.
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
@@ -68,11 +78,11 @@ class ImageSourceGP(SourcesInFrame):
     def __init__(
         self, searches: int = 6, budget_s: float | None = None, search_rows: int = 700, rows: int = 3000,
         margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Offsets = "none",
-        clutter: bool = True, seed: int = 0,
+        clutter: bool = True, seed: int = 0, start: Callable[[Measurements, np.ndarray], Found] | None = None,
     ) -> None:  # fmt: skip
-        self.budget_s, self.settings = (
-            budget_s,
-            SearchSettings(searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed),
+        self.budget_s, self._start = budget_s, start
+        self.settings = SearchSettings(
+            searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
         )
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -122,8 +132,8 @@ class ImageSourceGP(SourcesInFrame):
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
-            look = raced(context.race, group, partial(self._missed, data.batch(group)))
-        members = self._search(row_sets, settings, budget, cache, look)
+            look = partial(self._looked, context.race, group, data.batch(group))
+        members = self._search(row_sets, settings, budget, cache, look, partial(self._found, data, known))
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -185,20 +195,29 @@ class ImageSourceGP(SourcesInFrame):
         # Search number n is the same however many there are: a resumed run may ask for more.
         settings = replace(self.settings, searches=1, seed=0)
         seed = str(self.settings.seed)
-        return {"data": identity(data), "rows": rows, "seed": seed, "settings": str(settings)}
+        told = f"{settings}, {'alone' if self._start is None else 'from directions'}"
+        return {"data": identity(data), "rows": rows, "seed": seed, "settings": told}
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        look: Look | None = None,
+        look: Look | None = None, start: Start | None = None,
     ) -> list[Member]:  # fmt: skip
-        return search_many(row_sets, self._transmitter(), settings, self.noise_floor, budget, cache, look)
+        still = self._transmitter()
+        return search_many(row_sets, still, settings, self.noise_floor, budget, cache, look, start)
 
-    def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
-        """What a search's scene misses (n, ...) of a batch that it left out."""
+    def _found(self, data: Measurements, known: np.ndarray, number: int) -> Found | None:
+        """What a search by its number starts from, in the frame."""
+        if self._start is None or data.directions is None:
+            return None
+        places, amplitude = self._start(data, self._kept(known, number))
+        return places - self.frame.middle, amplitude
+
+    def _looked(self, race: Race, group: np.ndarray, batch: Batch, rows: Rows, scene: Scene) -> None:
+        """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
-        return mean - batch.target / self.factors[:, None]
+        race.looked(f"{len(scene.sequences)} sources", group, mean - batch.target / self.factors[:, None])
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
