@@ -20,15 +20,8 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
-from gsparc.models.image_sources.ensemble import (
-    Look,
-    Start,
-    at_noise_floor,
-    refined,
-    search_many,
-    weights_of,
-)
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import Offsets, estimate
@@ -139,7 +132,7 @@ class ImageSourceGP(SourcesInFrame):
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known)
                 # Factors change little the second time: a refinement does, no other search.
-                members = [refined(row_sets[one.number], one) for one in members]
+                members = [ensemble.refined(row_sets[one.number], one) for one in members]
         rows = self._rows(data, known)
         self._become(rows, members)
         self.held = self._left_out_rows(data, known, members, len(rows))
@@ -155,14 +148,14 @@ class ImageSourceGP(SourcesInFrame):
     def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights."""
         self._conditioned(rows, [member.scene for member in members])
-        self.weights = weights_of(members)
+        self.weights = ensemble.weights_of(members)
         return self
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
-        agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
+        agree = ensemble.at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
         inside = int(scene.scatterers(self.members[0].rows).sum())
@@ -200,10 +193,11 @@ class ImageSourceGP(SourcesInFrame):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        look: Look | None = None, start: Start | None = None,
+        look: ensemble.Look | None = None, start: ensemble.Start | None = None,
     ) -> list[Member]:  # fmt: skip
         still = self._transmitter()
-        return search_many(row_sets, still, settings, self.noise_floor, budget, cache, look, start)
+        floor = self.noise_floor
+        return ensemble.search_many(row_sets, still, settings, floor, budget, cache, look, start)
 
     def _found(self, data: Measurements, known: np.ndarray, number: int) -> Found | None:
         """What a search by its number starts from, in the frame."""
