@@ -34,15 +34,9 @@ COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes it
 
 
 def search_many(
-    row_sets: list[Rows],
-    transmitter: Tensor,
-    settings: SearchSettings,
-    noise_floor: float,
-    budget: TimeBudget,
-    cache: SearchCache,
-    look: Look | None = None,
-    start: Start | None = None,
-) -> list[Member]:
+    row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
+    budget: TimeBudget, cache: SearchCache, look: Look | None = None, start: Start | None = None,
+) -> list[Member]:  # fmt: skip
     """Run one search per set of rows, best first; at least one, others while the budget lasts.
 
     The first two that have reached the noise floor are the last: searches of higher numbers do not start, or

@@ -193,11 +193,10 @@ class ImageSourceGP(SourcesInFrame):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        look: ensemble.Look | None = None, start: ensemble.Start | None = None,
+        *more: Any,
     ) -> list[Member]:  # fmt: skip
-        still = self._transmitter()
-        floor = self.noise_floor
-        return ensemble.search_many(row_sets, still, settings, floor, budget, cache, look, start)
+        still, floor = self._transmitter(), self.noise_floor
+        return ensemble.search_many(row_sets, still, settings, floor, budget, cache, *more)
 
     def _found(self, data: Measurements, known: np.ndarray, number: int) -> Found | None:
         """What a search by its number starts from, in the frame."""

@@ -28,8 +28,11 @@ Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
 
 
 def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Return image sources of several searches, and a process on what they leave."""
-    start = partial(where_rays_meet, init.rows, context.seed)
+    """Return image sources of several searches, and a process on what they leave.
+
+    Searches start where measured directions meet, but for `init=sources`, which is without them.
+    """
+    start = None if init.name == "sources" else partial(where_rays_meet, init.rows, context.seed)
     method = ImageSourceGP(**_searched(init, clutter, context), start=start)
     return Residual(method) if residual else method
 

@@ -149,7 +149,9 @@ def weigh_candidates(
     assert cut is not None
     single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
     unit = np.where(cut.unit == NOT_TESTED, single, cut.unit)[rows]
-    weights = solution_weights.weights(predicted, target, unit)
+    # A search that went on has errors of its own: here a mixture need not be surely better, too.
+    sure = 0.0 if set(solutions).intersection(SEARCHES) else 1.0
+    weights = solution_weights.weights(predicted, target, unit, sure)
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
             "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,

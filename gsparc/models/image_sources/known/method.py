@@ -61,7 +61,7 @@ class KnownWallsGP(ImageSourceGP):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        *unused: Any, **named: Any,
+        *unused: Any,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
         rows = row_sets[0]
