@@ -1,4 +1,4 @@
-"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map.
+"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map; `gsparc.ops` is the folder `ops/`.
 
 >>> import gsparc
 >>> predictor = gsparc.load("model.ckpt")  # or gsparc.fit(rx=..., tx=..., rssi=...)

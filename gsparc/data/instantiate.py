@@ -71,17 +71,21 @@ def refuse_foreign(path: Any) -> None:
     target = find(path) if ours else None
     if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
-    if not any(path in plugins(group).values() for group in GROUPS):
-        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")
+    if not any(path in plugins(group).values() for group in OF_FILES):
+        raise ValueError(
+            f"the file asks to run {path!r}, which is not a class of gsparc; refused (a term of your own: "
+            "import the file that defines it first)"
+        )
 
 
 GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}
+OF_FILES = {**GROUPS, "terms": "gsparc.terms"}  # whose classes a stored configuration may name
 PLAIN = (bool, int, float, str, list, dict, type(None))
 
 
 def plugins(group: str) -> dict[str, str]:
-    """Return the import path `module.Class` of every plugin of a config group, `model` or `dataset`."""
-    return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=GROUPS[group])}
+    """Return the import path `module.Class` of every plugin: of `model`, `dataset` or `terms`."""
+    return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])}
 
 
 def node_of(kind: type) -> dict[str, Any]:

@@ -48,7 +48,8 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
 
     Args:
         config: `_target_` and its arguments.
-        trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc or of an
+            installed plugin, or a term that was imported.
 
     Raises:
         ValueError: no or wrong `_target_`, or settings it does not take.
@@ -57,13 +58,15 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     target = node.get("_target_")
     if target is None:
         raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
+    from gsparc.models.method import MethodFactory
+    from gsparc.processes.term import KINDS
+
     if not trusted:
         for path in targets(OmegaConf.to_container(node, resolve=False)):
-            refuse_foreign(path)
-    from gsparc.models.method import MethodFactory
-
+            if path not in KINDS:  # a term of the user's that they have imported
+                refuse_foreign(path)
     with heeded.apart():  # what is handed on is not used yet
-        method = instantiate(complete(deepcopy(node)))
+        method = instantiate(complete(deepcopy(node)), _convert_="all")
     if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method

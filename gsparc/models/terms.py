@@ -93,7 +93,7 @@ def called_for(
         if obstacle is None or "=" in obstacle:  # other settings decide, not the data
             why = obstacle if switch == "auto" else "as configured"
             options.append(f"model.effects.{name}")
-            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (f": {why}" if why else ""))
+            reasons.append(f"effects.{name} -> {str(on[name]).lower()}" + (f": {why}" if why else ""))
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsparc.data.checks.coherence import allowed
 from gsparc.data.errors import DataError
+from gsparc.data.instantiate import arguments, suggest
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
@@ -59,7 +60,7 @@ def fit(
 
     Raises:
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
-        ValueError: no such model, one that cannot learn these measurements, or no unit of powers.
+        ValueError: no such model or setting, one that cannot learn these measurements, or no unit of powers.
     """
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
     given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
@@ -72,7 +73,10 @@ def fit(
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
-    factory = for_stations(method_class(model)(**(settings or {})), data)
+    kind, given = method_class(model), settings or {}
+    for name in given.keys() - arguments(kind):
+        raise ValueError(f"settings: model={model!r} has no {name!r}{suggest(name, arguments(kind))}")
+    factory = for_stations(kind(**given), data)
     fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit(factory, data, fold, context)

@@ -11,8 +11,14 @@ import torch
 from torch import Tensor
 
 PLUGINS = "gsparc.terms"  # entry points of installed terms
-_KINDS: dict[str, type[Term[Any]]] = {}  # by the name that `stored` gives them
+KINDS: dict[str, type[Term[Any]]] = {}  # by the name that `stored` gives them
 Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
+
+
+def name_of(kind: type) -> str:
+    """Return the name that a class is stored by: with its module where that is not ours."""
+    ours = kind.__module__.startswith("gsparc.")
+    return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
 
 
 class Term(ABC, Generic[Rows]):
@@ -23,7 +29,7 @@ class Term(ABC, Generic[Rows]):
 
     def __init_subclass__(cls, **rest: Any) -> None:
         super().__init_subclass__(**rest)
-        _KINDS[cls.__name__] = cls
+        KINDS[name_of(cls)] = cls
 
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:
@@ -73,7 +79,7 @@ class Columns(Term[Tensor]):
 
 def stored(term: Term[Any]) -> dict[str, Any]:
     """Return what `restored` reads: the name of the term's class, and its state."""
-    return {"term": type(term).__name__, "state": term.state()}
+    return {"term": name_of(type(term)), "state": term.state()}
 
 
 def restored(state: Mapping[str, Any]) -> Any:
@@ -83,10 +89,10 @@ def restored(state: Mapping[str, Any]) -> Any:
         ValueError: nothing that was imported defines a term of this name.
     """
     name = str(state["term"])
-    if name not in _KINDS:
+    if name not in KINDS:
         for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
-            if point.attr == name:
+            if f"{point.module}.{point.attr}" == name:
                 point.load()
-    if name not in _KINDS:
+    if name not in KINDS:
         raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
-    return _KINDS[name].read(state["state"])
+    return KINDS[name].read(state["state"])

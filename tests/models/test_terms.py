@@ -73,7 +73,7 @@ def test_inverse_distance_was_refused_with_advice_that_undid_it(caplog):
     falls = AttenuationSettings(inverse_distance=True)
     caplog.set_level("INFO", "gsparc")
     assert chosen("array", attenuation=falls) == ((), False)
-    assert "effects.array -> off: attenuation.inverse_distance=true" in caplog.messages[0]
+    assert "effects.array -> false: attenuation.inverse_distance=true" in caplog.messages[0]
     with pytest.raises(ValueError, match=r"array=true is not possible: attenuation\.inverse_distance"):
         chosen("array", {"array": True}, attenuation=falls)
 

@@ -25,7 +25,7 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
-from gsparc.models.powers.own_terms import InWorld
+from gsparc.models.powers.own_terms import InWorld, learned
 from gsparc.models.powers.settings import candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.processes.nearest import Nearest
@@ -86,6 +86,9 @@ class PowerField(ClosedForm):
         self.site, self.fringes = data.site, None
         notes = self._choose(data, rows, budget)
         self.condition(data, rows)
+        own = tuple(one for one in self.trend.more if isinstance(one, InWorld))
+        if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
+            notes = (*notes, *learned(self.powers.posterior, own))
         return FitReport(budget.counted.wall, notes, budget.limited_by)
 
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:

@@ -1,35 +1,14 @@
-"""Terms of a user's own (`model.terms`), as objects or as entries of a configuration; see docs/terms.md."""
+"""Terms of a user's own (`model.terms`); see docs/terms.md."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
-from gsparc.data.instantiate import find
+from gsparc.processes.posterior import Exact
 from gsparc.processes.term import Columns, restored, stored
-
-
-def columns_of(entry: Any) -> Columns:
-    """Return a term as it is, or what `{term: module.Class, argument: value, ...}` describes.
-
-    Raises:
-        ValueError: there is no such class, it is no such term, or it does not take these arguments.
-    """
-    if isinstance(entry, Mapping):
-        rest = {name: value for name, value in entry.items() if name != "term"}
-        kind = find(str(entry.get("term")))
-        if not isinstance(kind, type):
-            raise ValueError(f"model.terms: {entry.get('term')!r} is no class that can be imported")
-        try:
-            entry = kind(**rest)
-        except TypeError as error:
-            raise ValueError(f"model.terms: {error}") from None
-    if not isinstance(entry, Columns):
-        raise ValueError(f"model.terms: {entry!r} is not a gsparc.processes.term.Columns")
-    return entry
 
 
 @dataclass(frozen=True)
@@ -45,9 +24,17 @@ class InWorld(Columns):
     origin: Tensor
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Columns`; of places in local coordinates."""
+        """See `Columns`; of places in local coordinates.
+
+        Raises:
+            ValueError: the term's columns have another shape, or a NaN or an infinity.
+        """
         # Places are of one end (n, 3), or of both (n, 6).
-        return self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
+        result = self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
+        if result.ndim != 2 or len(result) != len(places) or not result.isfinite().all():
+            name, shape = type(self.term).__name__, (*result.shape,)
+            raise ValueError(f"{name}.columns gave {shape}; ({len(places)}, Q) finite numbers are needed")
+        return result
 
     def state(self) -> dict[str, Any]:
         """See `Term`."""
@@ -57,3 +44,18 @@ class InWorld(Columns):
     def read(cls, state: dict[str, Any]) -> InWorld:
         """See `Term`."""
         return cls(restored(state["term"]), state["origin"])
+
+
+def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:
+    """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
+    at = posterior.rows
+    columns = posterior.prior.columns(at)
+    weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude
+    # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
+    left = (scale * (1 - posterior.factor.whitened(columns).square().sum(0)).clamp_min(0)).sqrt()
+    sizes = [one.columns(at[:1]).shape[1] for one in own]
+    parts = (part[-sum(sizes) :].split(sizes) for part in (weights, left))
+    return [
+        f"{type(one.term).__name__}: " + ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in zip(*both, strict=True))
+        for one, *both in zip(own, *parts, strict=True)
+    ]

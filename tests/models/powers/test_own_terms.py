@@ -1,16 +1,21 @@
 """A term of a user's own, of examples/own-term: learned, stored, read back, refused."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from doors import knock
+from omegaconf import OmegaConf
 
 import gsparc
+from gsparc.commands.listing import COMMANDS
+from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
-from gsparc.processes import term
+from gsparc.processes import term, trend
 
 FILE = Path(__file__).parents[3] / "examples" / "own-term" / "trees.py"
 STILL = [300.0, -100.0, 20.0]  # far from the origin of local coordinates
@@ -24,7 +29,7 @@ def trees(monkeypatch):
     monkeypatch.setitem(sys.modules, "trees", module)
     spec.loader.exec_module(module)
     yield module.Trees
-    term._KINDS.pop("Trees", None)
+    term.KINDS.pop("trees.Trees", None)
 
 
 def town(count: int = 160) -> dict[str, np.ndarray]:
@@ -51,23 +56,70 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
     known = {"rx": data["rx"][:40], "tx": STILL, "rssi": data["rssi"][:40], "model": "powers"}
     asked, truth = data["rx"][40:], data["rssi"][40:]
     plain = gsparc.fit(**known)
-    entry = {"term": "trees.Trees", "corners": GROVE, "still": STILL}
-    for given in (trees(GROVE, STILL), entry):
-        own = gsparc.fit(**known, settings={"terms": [given]}, save=path)
-        errors = [np.std(one.rssi(rx=asked)[:, 0] - truth) for one in (own, plain)]
-        assert errors[0] < 0.9 * errors[1], errors
-        np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), own.rssi(rx=asked), atol=1e-5)
-    term._KINDS.pop("Trees")
-    with pytest.raises(CheckpointError, match="no term is called 'Trees': import the file that defines it"):
+    own = gsparc.fit(**known, settings={"terms": [trees(GROVE, STILL)]}, save=path)
+    errors = [np.std(one.rssi(rx=asked)[:, 0] - truth) for one in (own, plain)]
+    assert errors[0] < 0.9 * errors[1], errors
+    np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), own.rssi(rx=asked), atol=1e-5)
+    term.KINDS.pop("trees.Trees")
+    with pytest.raises(CheckpointError, match=r"no term is called 'trees\.Trees': import the file"):
         gsparc.load(path)
 
 
-@pytest.mark.parametrize("entry, why", [
-    ({"term": "trees.Bushes"}, "'trees.Bushes' is no class"),
-    ({"term": "trees.Trees", "corners": []}, "missing 1 required positional argument: 'still'"),
-    (3, "3 is not a gsparc.processes.term.Columns"),
-])  # fmt: skip
-def test_what_is_no_term_is_refused(trees, entry, why):
+def test_what_is_no_term_is_refused():
     data = town()
-    with pytest.raises(ValueError, match=why):
-        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings={"terms": [entry]})
+    with pytest.raises(ValueError, match="3 is not a gsparc"):
+        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings={"terms": [3]})
+
+
+def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
+    class Flat(trees):
+        def columns(self, places):
+            return super().columns(places)[:, 0]
+
+    data = town(40)
+    own = {"terms": [Flat(GROVE, STILL)]}
+    with pytest.raises(ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"):
+        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings=own)
+
+
+def test_a_term_may_have_the_name_of_one_of_ours():
+    class Walls(term.Columns):
+        def columns(self, places):
+            return places[:, :1]
+
+    wall = trend.Walls(torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1, 2), torch.zeros(3))
+    assert isinstance(term.restored(term.stored(wall)), trend.Walls)
+    assert isinstance(term.restored(term.stored(Walls())), Walls)
+
+
+def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
+    data, file = town(60), tmp_path / "town.npz"
+    levels = {"rx_position": data["rx"], "tx_position": STILL, "rssi_db": data["rssi"]}
+    np.savez(file, **levels)
+    grove = f"model.terms=[{{_target_: trees.Trees, corners: {GROVE}, still: {STILL}}}]".replace(" ", "")
+    folder = tmp_path / "run"
+    settings = [f"dataset.file={file}", f"hydra.run.dir={folder}", "baselines=[]", "logger=none"]
+    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=powers", *settings, grove])
+    assert answer.status == 0, answer
+    log = (folder / "train.log").read_text()
+    said = re.search(r"Trees: (\S+) \+- (\S+)", log)
+    assert said and abs(float(said[1]) + 4.0) < 3 * float(said[2])  # a unit is ten metres: .4 dB each
+    assert gsparc.load(folder / "model.ckpt").rssi(rx=data["rx"]).shape == (60, 1)
+
+
+def test_opening_a_checkpoint_runs_nothing_that_its_terms_name(tmp_path):
+    made, path = tmp_path / "made", tmp_path / "model.ckpt"
+    data = town(20)
+    fitted = gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers")
+    terms = [{"_target_": "subprocess.Popen", "args": ["touch", str(made)]}]
+    model = {"_target_": "gsparc.models.mixture.methods.Powers", "terms": terms}
+    checkpoint.save(path, fitted.method, OmegaConf.to_yaml({"model": model}))
+    with pytest.raises(CheckpointError, match=r"asks to run 'subprocess\.Popen'"):
+        gsparc.load(path)
+    assert not made.exists()
+
+
+def test_a_setting_that_the_model_lacks_is_named():
+    data = town(20)
+    with pytest.raises(ValueError, match="settings: model='kriging' has no 'terms'"):
+        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="kriging", settings={"terms": []})
