@@ -16,6 +16,7 @@ from torch import Tensor
 
 LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
 SURE = 1.0  # standard errors of paired rows
+STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 
 
 class Behind(ValueError):
@@ -44,27 +45,30 @@ class Race:
         missed = (mean - target).detach()
         return cls(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
-    def looked(self, what: str, rows: np.ndarray, missed: Tensor) -> None:
-        """Look at another candidate, where both left rows out.
+    def looked(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
+        """Return the mean squared error of another candidate, where both left rows out.
 
         Args:
             what: it is, for the learning curve.
             rows: (m,) rows, which it missed by `missed` (m, ...).
+            before: what was returned a look ago; infinity at the first.
 
         Raises:
-            Behind: at most `LEAST_GAIN` is to be gained by weighing it, even `SURE` errors above.
+            Behind: it is `STALLED`, and weighing it gains less than `LEAST_GAIN`, even `SURE` errors above.
         """
-        self.note(what, mean_square(missed))
+        now = mean_square(missed)
+        self.note(what, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
         best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
         whole = max(float(best.abs().square().sum()), 1e-30)
         gains = (best * (best - own).conj()).real.double().sum(1) / whole
         gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
-        if gain + SURE * error < LEAST_GAIN:
+        if now > STALLED * before and gain + SURE * error < LEAST_GAIN:
             raise Behind(
                 f"{what}: a mean with what misses {self.error:.3f} of the energy of rows held out would "
                 f"gain {gain:.0%} at most, give or take {error:.0%}"
             )
+        return now
 
 
 def mean_square(values: Tensor) -> float:

@@ -26,6 +26,7 @@ def test_a_candidate_far_behind_goes_on_where_its_errors_are_its_own():
 def test_a_candidate_ends_that_misses_what_the_best_misses():
     with pytest.raises(Behind, match=r"^near: a mean with what misses 0\.0\d+ .* would gain -?\d+% at most"):
         race().looked("near", ROWS, OWN[0] + 0.1 * OWN[1])
+    assert race().looked("falling", ROWS, OWN[0] + 0.1 * OWN[1], 3.0) == pytest.approx(1, rel=0.2)
 
 
 def test_only_rows_that_both_left_out_are_compared():

@@ -125,7 +125,7 @@ class ImageSourceGP(SourcesInFrame):
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
-            look = partial(self._looked, context.race, group, data.batch(group))
+            look = partial(self._looked, context.race, group, data.batch(group), [math.inf])
         members = self._search(row_sets, settings, budget, cache, look, partial(self._found, data, known))
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
@@ -205,12 +205,15 @@ class ImageSourceGP(SourcesInFrame):
         places, amplitude = self._start(data, self._kept(known, number))
         return places - self.frame.middle, amplitude
 
-    def _looked(self, race: Race, group: np.ndarray, batch: Batch, rows: Rows, scene: Scene) -> None:
+    def _looked(
+        self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
+    ) -> None:
         """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
-        race.looked(f"{len(scene.sequences)} sources", group, mean - batch.target / self.factors[:, None])
+        missed = mean - batch.target / self.factors[:, None]
+        errors.append(race.looked(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
