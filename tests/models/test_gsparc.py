@@ -240,6 +240,7 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
 
 def test_a_search_that_could_gain_too_little_ends(monkeypatch, caplog):
     monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
+    monkeypatch.setattr(race, "STALLED", -math.inf)
     fitted = fit("channels", budget_s=1e3)
     assert "init=sources is left out: " in caplog.text
     assert fitted.method.facts()["model/init"] == "diffuse" and "sources" in fitted.report.cost.unused

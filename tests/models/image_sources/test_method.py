@@ -123,6 +123,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
 
 def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, monkeypatch):
     monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
+    monkeypatch.setattr(race, "STALLED", -math.inf)
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
     method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
     group, looks = fold.train[::3], []
