@@ -11,7 +11,8 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split, write_split
+from gsparc.data.split_files import write_split
+from gsparc.data.splits import Split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import remarks, results_table, write_samples

@@ -26,7 +26,8 @@ from gsparc.data.files import SUMMARY, is_address, set_aside
 from gsparc.data.instantiate import find, node_of, suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Scored
-from gsparc.data.splits import Split, write_split
+from gsparc.data.split_files import write_split
+from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain

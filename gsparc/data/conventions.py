@@ -123,7 +123,8 @@ def _with_delays(signals: Signals) -> Signals:
 
 def _without_zeros(signals: Signals) -> Signals:
     # A tone that is 0 in all rows and antennas was not measured, like guard tones of OFDM.
-    measured = np.broadcast_to((signals.values != 0).any(axis=(0, 1)), signals.values.shape)
+    heard = [(signals.values[part] != 0).any(axis=(0, 1)) for part in blocks(signals.values)]
+    measured = np.broadcast_to(np.any(heard, axis=0), signals.values.shape)
     return replace(signals, mask=measured if signals.mask is None else measured & signals.mask)
 
 
@@ -241,7 +242,9 @@ def mended(signals: Signals, names: Iterable[str]) -> Signals:
         if not one.applies(signals):
             shape = signals.values.shape[1:]
             raise DataError(f"dataset.{name}: {one.words}: cannot be of rows of shape {shape}")
-        signals = _in_blocks(signals, one.change) if is_big(signals.values) else one.change(signals)
+        # Which tones are 0 is a matter of all rows, and changes no value.
+        by_block = is_big(signals.values) and name != "zeros_unmeasured"
+        signals = _in_blocks(signals, one.change) if by_block else one.change(signals)
     return signals
 
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data import splits
+from gsparc.data import spacing
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements, TrainTest
+from gsparc.data.spacing import between
 from gsparc.data.splits import CORNERS, AnySplit, FileSettings, Fold, SplitSettings, make_split
 
 Draws = np.random.Generator
@@ -73,7 +74,7 @@ def inner_folds(
         DataError: fewer than 2 places to cut.
     """
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    positions, place = positions - positions.min(axis=0), splits.visits(positions, place)
+    positions, place = positions - positions.min(axis=0), spacing.visits(positions, place)
     number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
     which, where = which.reshape(-1), positions[known][first]
@@ -129,7 +130,7 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
     if split.name == "sparse":  # as dense as what is learned from: thinned again it would be another task
         whole["name"] = "random"
     if split.name == "blocks" and split.side_m is None:
-        whole["side_m"] = max(splits.tenth(positions[:, :2]), np.finfo(float).tiny)
+        whole["side_m"] = max(spacing.tenth(positions[:, :2]), np.finfo(float).tiny)
     if split.name == "grouped":  # stretches as long as those of the test
         whole["folds"] = max(split.folds - 1, 2)
     return replace(split, **whole)  # type: ignore[arg-type]
@@ -141,11 +142,9 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
     settings = SplitSettings(test_fraction=share, val_fraction=share)
     if not len(fold.val) or len(fold.train) < 2:
         return settings
-    places = np.unique(positions[fold.train], axis=0)
-    tree = cKDTree(places)
-    gap = float(np.median(tree.query(positions[fold.val])[0]))
-    usual = float(np.median(tree.query(places, k=2)[0][:, 1])) if len(places) > 1 else gap
-    if not gap > FARTHER * usual:
+    places = positions[fold.train]
+    gap = float(np.median(cKDTree(places).query(positions[fold.val])[0]))
+    if not gap > FARTHER * (between(places) or gap):
         return settings
     known = np.sort(np.concatenate([fold.train, fold.val]))
     where = positions[known]
@@ -173,7 +172,7 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> 
             except DataError:
                 side /= 2
                 continue
-            return InnerFolds("blocks", folds, splits.square_of(where[:, :2], side))
+            return InnerFolds("blocks", folds, spacing.square_of(where[:, :2], side))
     corners = [settings.corner]
     if settings.name == "corner":
         others = [corner for corner in CORNERS if corner != settings.corner]
@@ -223,11 +222,8 @@ def _draws(
 def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds | None:
     """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
     number, name = int(station.max()) + 1, settings.name
-    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if name == "runs":
-        together = max(round(settings.test_fraction * number), 1)
-    together = min(together, number - 2)
-    settings = replace(settings, name="stations", leave_out=max(together, 0))
+    together = max(min(settings.together(number), number - 2), 0)
+    settings = replace(settings, name="stations", leave_out=together)
     where = np.zeros((len(station), 3))
     if number == 1:
         return None

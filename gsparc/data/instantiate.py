@@ -104,12 +104,9 @@ def arguments(kind: type) -> dict[str, Any]:
     """Return what a class takes, with defaults; `**names` is what its base class, or `hands_on`, takes."""
     if kind is object:
         return {}
-    own = list(inspect.signature(kind.__init__).parameters.values())[1:]  # type: ignore[misc]
-    base = (
-        arguments(vars(kind).get("hands_on", kind.__mro__[1]))
-        if any(p.kind is p.VAR_KEYWORD for p in own)
-        else {}
-    )
+    own, base = list(inspect.signature(kind.__init__).parameters.values())[1:], {}  # type: ignore[misc]
+    if any(p.kind is p.VAR_KEYWORD for p in own):
+        base = arguments(vars(kind).get("hands_on", kind.__mro__[1]))
     named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     return {**named, **{name: default for name, default in base.items() if name not in named}}
 

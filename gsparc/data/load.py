@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -15,14 +15,15 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data import splits
+from gsparc.data import spacing
 from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, nearest
-from gsparc.data.instantiate import find, from_settings, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import arguments, find, from_settings, refuse_foreign, suggest, targets
 from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, read_split, without
+from gsparc.data.split_files import read_split
+from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, without
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +99,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         absent = left_out(settings.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
     unit = data.run if settings.name == "runs" else data.station
-    place = splits.visits(data.moving, data.place)
+    place = spacing.visits(data.moving, data.place)
     if place is not None and place is not data.place:
         text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
         log.info(text, len(data), len(np.unique(place)))
@@ -141,30 +142,28 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     return choices[str(name)]
 
 
-def _parameters(kind: Any) -> dict[str, inspect.Parameter]:
-    """What `kind` takes; what a dataset's class hands on by keyword is what its reader or its base takes."""
-    known = dict(inspect.signature(kind).parameters)
-    base = (kind.__base__ if isinstance(kind, type) else None) or object
-    more: dict[str, inspect.Parameter] = {}
-    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
-        if base is not DataModule and issubclass(base, DataModule):
-            more = _parameters(base)
-        if hasattr(kind, "reader"):
-            _, *settings = inspect.signature(kind.reader).parameters.values()  # without the file or folder
-            more |= {p.name: p for p in settings}
-        for name in getattr(kind, "switches", ()):  # which the reader takes by keyword
-            more[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None)
-    return {name: p for name, p in {**more, **known}.items() if not more or p.kind is not p.VAR_KEYWORD}
+def _parameters(kind: Any) -> dict[str, Any]:
+    """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
+    own = (
+        arguments(kind) if isinstance(kind, type) else _defaults(inspect.signature(kind).parameters.values())
+    )
+    _, *read = inspect.signature(getattr(kind, "reader", lambda path: path)).parameters.values()
+    return {**dict.fromkeys(getattr(kind, "switches", ())), **_defaults(read), **own}
+
+
+def _defaults(parameters: Iterable[inspect.Parameter]) -> dict[str, Any]:
+    return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
     """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
-    known = _parameters(kind)
-    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
-        return settings
-    accepted, name = {}, settings.get("name")
+    own = inspect.signature(kind).parameters.values()
+    if any(p.kind is p.VAR_KEYWORD for p in own) and not hasattr(kind, "reader"):
+        return settings  # it checks them itself
+    known, accepted, name = _parameters(kind), dict[str, Any](), settings.get("name")
+    needed = {key for key, default in known.items() if default is inspect.Parameter.empty}
     for key, value in settings.items():
-        if value == "???" and key in known and known[key].default is not inspect.Parameter.empty:
+        if value == "???" and key in known and key not in needed:
             continue
         if key in known or key.startswith("_"):
             accepted[key] = value
@@ -173,7 +172,7 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
             if other in known:
                 raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest(key, known)}")
-    for key, parameter in known.items():
-        if parameter.default is parameter.empty and accepted.get(key) in (None, "", "???"):
+    for key in known:
+        if key in needed and accepted.get(key) in (None, "", "???"):
             raise DataError(f"dataset.{key} is not set; say dataset.{key}={key.upper()} for dataset={name}")
     return accepted

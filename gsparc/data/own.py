@@ -18,6 +18,7 @@ from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import far_ends, peaks, too_strong
 from gsparc.data.conventions import Signals, mended
+from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
@@ -196,9 +197,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
     if normalisation not in NORMALISATIONS:
         check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
     error, stand_in = attributes.get("convergence_error"), attributes.get("stand_in")
-    # In Python bool is an int: `true` would be an error of 1.
-    number = isinstance(error, int | float) and not isinstance(error, bool)
-    if error is not None and not (number and np.isfinite(error) and error >= 0):
+    if not or_null(number(0)).holds(error):
         error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
     for name in ("name", "stand_in"):
         if not isinstance(attributes.get(name), str | None):

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-import difflib
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
-from gsparc.data.errors import Problems
+from gsparc.data.errors import Problems, nearest
 from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
+
+
+Shape = tuple[int | str | None, ...]
+
+
+def _fits(sizes: tuple[int, ...], shape: Shape) -> bool:
+    return len(sizes) == len(shape) and all(want in (None, n) for want, n in zip(shape, sizes, strict=True))
 
 
 class Checker:
@@ -28,6 +35,7 @@ class Checker:
         self.notes: list[str] = []
         self.row_names: list[str] = []
         self.unknown: str | None = None  # a position that nobody gave
+        self.sizes: dict[str, int] = {}  # of axes by their letter
 
     def where(self, name: str) -> str:
         """Say how messages name an array of this file."""
@@ -56,9 +64,8 @@ class Checker:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            close = [n for n in difflib.get_close_matches(name, FIELDS, n=3) if n not in self.raw.arrays]
-            if close:
-                self.refuse(name, f"unknown name; did you mean {close[0]}?")
+            if hint := nearest(name, [known for known in FIELDS if known not in self.raw.arrays], 0.6):
+                self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")
 
@@ -84,9 +91,9 @@ class Checker:
             self.row_names = [str(name) for name in names]
         return self.row_names
 
-    def array(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+    def array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
         """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
-        array, kinds = self.raw.arrays.get(name), KINDS.get(name, REAL)
+        array, kinds = self.raw.arrays.get(name), kinds or KINDS.get(name, REAL)
         if array is None:
             return None
         # Images of uint16 hold no stated largest value; of uint8 it is 255.
@@ -95,25 +102,23 @@ class Checker:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
         return array if self.fits(name, array, *shapes) else None
 
-    def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
+    def real(self, name: str, *shapes: Shape) -> np.ndarray | None:
         """Return the same as float64."""
         array = self.array(name, *shapes)
         return None if array is None else array.astype(np.float64)
 
-    def fits(self, name: str, array: np.ndarray, *shapes: tuple[int | None, ...]) -> bool:
-        """Tell whether `array` has one of `shapes`; note it when not."""
-        for shape in shapes:
-            if array.ndim == len(shape) and all(
-                want is None or want == size for want, size in zip(shape, array.shape, strict=True)
-            ):
-                return True
+    def fits(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
+        """Tell whether `array` has one of `shapes`, letters for sizes found before; note it when not."""
+        wanted = [tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes]
+        if any(_fits(array.shape, shape) for shape in wanted):
+            return True
         # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
-        turned = array.ndim > 1 and (array.shape[::-1] in shapes or len(array) == 3)
-        constrained = any(count is not None for shape in shapes for count in shape)
-        here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
-        actual = f"{array.shape}{'; transposed?' if turned else ''}"
-        known = f" {FIELDS[name].shape}" if name in FIELDS else ""
-        self.refuse(name, f"expected shape{known}{here}, found {actual}")
+        turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
+        here = " or ".join(str(shape).replace("None", "any") for shape in wanted)
+        here = f", here {here}" if any(size is not None for shape in wanted for size in shape) else ""
+        known = FIELDS[name].shape if name in FIELDS else str(shapes[0]).replace("'", "")
+        fault = f"found {array.shape}{'; transposed?' if turned else ''}"
+        self.refuse(name, f"expected shape {known}{here}, {fault}")
         return False
 
     def position(self, name: str, rows: int | None) -> np.ndarray | None:
@@ -207,11 +212,16 @@ class Checker:
         if present == ["rx_rotation"]:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
+        return self.turned("rx_orientation", values, self.row_names)
+
+    def turned(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
+        """Return rotations (n, 3, 3) of quaternions (n, 4) of an array."""
         good = is_unit(values)
-        wrong = np.flatnonzero(~good)
-        bad = (f"{self.row_names[i]} = {np.array2string(values[i], separator=', ')}" for i in wrong)
-        where = self.where("rx_orientation")
-        self.problems.add_rows(where, bad, "expected a quaternion (w, x, y, z) of length 1")
+        bad = (
+            f"{rows[i]} = {np.array2string(values[i], separator=', ')}"
+            for i in np.flatnonzero(~good).tolist()
+        )
+        self.problems.add_rows(self.where(name), bad, "expected a quaternion (w, x, y, z) of length 1")
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
 
     def grid(self, height: int, width: int) -> SphereGrid | None:
@@ -280,27 +290,14 @@ UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this
 
 def is_unit(quaternion: np.ndarray) -> np.ndarray:
     """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...) bool."""
-    return np.abs(_length(quaternion) - 1) <= UNIT_TOLERANCE
-
-
-def _length(quaternion: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.linalg.norm(quaternion, axis=-1)
+        return np.abs(np.linalg.norm(quaternion, axis=-1) - 1) <= UNIT_TOLERANCE
 
 
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
-
-    Raises:
-        ValueError: a quaternion is not finite or its length differs from 1 by more than 1 %.
-    """
-    q = np.asarray(quaternion, dtype=np.float64)
-    if not is_unit(q).all():
-        order = "w, x, y, z" if scalar_first else "x, y, z, w"
-        raise ValueError(f"expected a quaternion ({order}) of length 1, got length {_length(q)!s}")
+    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4) of length 1."""
     # SciPy expects the scalar last and normalises, which removes the rounding of printed digits.
-    if scalar_first:
-        q = np.roll(q, -1, axis=-1)
+    q = np.roll(quaternion, -1, axis=-1) if scalar_first else quaternion
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
 
 

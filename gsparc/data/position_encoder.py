@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from gsparc.data.assemble import content_hash
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
+from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.raw import stored_archive
 
 log = logging.getLogger(__name__)
@@ -88,7 +89,7 @@ CODE = 3
 
 
 @dataclass(frozen=True)
-class EncoderSettings:
+class EncoderSettings(Checked):
     """Shape and training of the encoder.
 
     Attributes:
@@ -101,20 +102,13 @@ class EncoderSettings:
         size_m: codes fill a cube of about this edge, so that lengths are of the order of metres.
     """
 
-    hidden: int = 128
+    hidden: int = setting(128, whole(1))
     spread: float = 0.1
-    steps: int = 2000
-    batch: int = 256
+    steps: int = setting(2000, whole(1))
+    batch: int = setting(256, whole(4))
     rate: float = 2e-3
     seed: int = 0
     size_m: float = 100.0
-
-    def __post_init__(self) -> None:
-        if self.hidden < 1 or self.steps < 1 or self.batch < 4:
-            raise ValueError(
-                f"encoder: hidden={self.hidden}, steps={self.steps}, batch={self.batch}: "
-                "expected at least 1, 1 and 4"
-            )
 
 
 class Autoencoder(nn.Module):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from gsparc.data.errors import DataError
-from gsparc.data.links.georeference import bad_degrees
+from gsparc.data.errors import DataError, Problems
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import ENDS, End
@@ -69,12 +69,12 @@ def read_query_places(
     """
     try:
         if is_table(path):
-            return _of_table(path, moving, columns)
+            return _of_sheet(*sheet_of(path), moving, columns)
         named = [name for name, value in columns.items() if value is not None]
         # Settings of columns have no meaning for named arrays, and would be ignored without a word.
         if named:
             raise DataError(f"columns.{named[0]}: goes with tables (*.csv, *.parquet), not with {path}")
-        return _of_arrays(read_raw(path), str(path), moving)
+        return replace(_of_sheet(_of_arrays(read_raw(path), str(path), moving), [], moving, {}), table=())
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
         first = error.problems[0].replace("dataset.columns", "columns")
@@ -91,29 +91,22 @@ def read_times(path: str | Path) -> np.ndarray | None:
     """
     if is_table(path):
         sheet, _ = sheet_of(path)
-        if "time_s" not in sheet.heads:
-            return None
-        times, rows = sheet.numbers("time_s"), sheet.rows
-        sheet.problems.raise_if_any()
     else:
-        raw = read_raw(path)
-        if "time_s" not in raw.arrays:
-            return None
-        check = Checker(raw, str(path))
-        times = check.real("time_s", (), (None,))
-        check.problems.raise_if_any()
-        # One time for all places is a number without an axis.
-        times = np.atleast_1d(np.asarray(times))
-        rows = tuple(f"row {i}" for i in range(len(times)))
+        time_s = read_raw(path).arrays.get("time_s")
+        sheet = _as_sheet(str(path), {} if time_s is None else {"time_s": time_s})
+    if "time_s" not in sheet.heads:
+        return None
+    times = sheet.numbers("time_s")
+    sheet.problems.raise_if_any()
     assert times is not None
-    if not np.isfinite(times).all():
-        row = rows[int(np.argmin(np.isfinite(times)))]
-        raise DataError(f"{path}, time_s, {row}: no number; expected seconds")
+    for row in np.flatnonzero(np.isnan(times)):
+        raise DataError(f"{path}, time_s, {sheet.rows[row]}: no number; expected seconds")
     return times
 
 
-def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
-    sheet, notes = sheet_of(path)
+def _of_sheet(
+    sheet: Sheet, notes: list[str], moving: Sequence[End], columns: Mapping[str, object]
+) -> QueryPlaces:
     chosen, guessed = choose(sheet, columns, only=GUESSED)
     sheet.problems.raise_if_any()
     by_end = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
@@ -136,8 +129,8 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
-    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads if head)
-    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, plain, name, (*notes, *guessed), table))
+    table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
+    return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, name, (*notes, *guessed), table)
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
@@ -154,83 +147,46 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
     return words
 
 
-def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
-    check = Checker(raw, source)
-    by_end = {end: _end(check, end, alone=len(moving) == 1) for end in moving}
-    check.problems.raise_if_any()
-    ends: dict[End, Places] = {end: where for end, where in by_end.items() if where is not None}
-    count = {end: len(where.across) for end, where in ends.items()}
-    # A row asks about one link: both ends have a place in it.
-    if len(set(count.values())) > 1:
-        raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
-    rows = tuple(f"row {i}" for i in range(next(iter(count.values()))))
-    if not rows:
-        raise DataError(f"{source}: no rows; expected a place or more")
-    return _checked(QueryPlaces(source, ends, rows, _stations(raw, source, len(rows))))
-
-
-def _end(check: Checker, end: End, alone: bool) -> Places | None:
-    """Places (n,) of an end; those without its name are of the one that is `alone`."""
-    # Unnamed arrays are taken only if one end moves, as they say nothing of which.
-    position = check.given(f"{end}_position", *(("position",) if alone else ()))[:1]
+def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Sheet:
+    """Arrays of places as columns of a table; where one end moves they need not name it."""
+    check, columns, alone = Checker(raw, source), dict[str, np.ndarray | None](), len(moving) == 1
     pair = check.given("latitude", "longitude") if alone else []
-    if position and pair:
-        fault = f"{position[0]} and {pair[0]} both say where; leave one out"
-        return check.problems.add(check.source, fault)
-    if len(pair) == 1 or not (position or pair):
-        wanted = "latitude and longitude, or " if alone else ""
-        fault = f"no places of the {ENDS[end]}; expected {wanted}{end}_position"
-        return check.problems.add(check.source, fault)
-    # Two columns are x and y without a height, which `with_heights` fills later.
-    shapes = ((2,), (3,), (None, 2), (None, 3)) if position else ((), (None,))
-    parts = [check.real(name, *shapes) for name in position or pair]
-    known = [part for part in parts if part is not None]
-    if len(known) < len(parts):
-        return None
-    if len({part.shape for part in known}) > 1:
-        both = " and ".join(str(part.shape) for part in known)
-        fault = f"latitude and longitude have shapes {both}; expected one shape"
-        return check.problems.add(check.source, fault)
-    across = np.column_stack(known) if pair else np.atleast_2d(known[0])
-    height = across[:, 2] if across.shape[1] == 3 else None
-    for name in check.given(f"{end}_height", *(("height",) if alone else ())):
-        # The third coordinate is the height; a second statement of it is not read.
-        values = None if height is not None else check.real(name, (), (1,), (len(across),))
-        height = height if values is None else np.broadcast_to(values, (len(across),))
-    return Places(across[:, :2], height, bool(pair))
-
-
-def _stations(raw: Raw, source: str, count: int) -> np.ndarray | None:
-    station = raw.arrays.get("station")
-    if station is None:
-        return None
-    station = station.reshape(-1)
-    if len(station) != count or station.dtype.kind not in "iuUS":
-        fault = f"found {station.dtype} of shape {raw.arrays['station'].shape}"
-        raise DataError(f"{source}, station: expected {count} names or numbers, {fault}")
-    names = raw.arrays.get("station_name")
+    for end in moving:
+        before, named = ("", True) if alone else (f"{end}_", False)
+        position = check.given(f"{end}_position", *["position"] * named)[:1]
+        if len(position) + len(pair) / 2 != 1:
+            fault = f"{end}_position" + ", or latitude and longitude" * alone
+            found = " and ".join([*position, *pair]) or "no places"
+            raise DataError(f"{source}: of the {ENDS[end]} expected {fault}; found {found}")
+        # Two columns are x and y without a height, which `with_heights` fills later.
+        for name in position:
+            places = check.real(name, (2,), (3,), (None, 2), (None, 3))
+            axes = () if places is None else np.atleast_2d(places).T
+            columns |= {f"{before}{axis}": values for axis, values in zip("xyz", axes, strict=False)}
+        columns |= {name: check.real(name, (), (None,)) for name in pair}
+        for name in check.given(f"{end}_height", *["height"] * named):
+            if f"{before}z" not in columns:  # a second statement of it is not read
+                columns[f"{before}z"] = check.real(name, (), (None,))
+    check.problems.raise_if_any()
+    station, names = raw.arrays.get("station"), raw.arrays.get("station_name")
     # Numbers refer to the file's own list, text to the model's names.
-    if station.dtype.kind in "iu" and names is not None:
+    if station is not None and names is not None and station.dtype.kind in "iu":
         wrong = np.flatnonzero((station < 0) | (station >= names.size))
         if len(wrong):
-            fault = f"{station[wrong[0]]} is none of the {names.size} of station_name"
+            fault = f"{station.flat[wrong[0]]} is none of the {names.size} of station_name"
             raise DataError(f"{source}, station, row {wrong[0]}: {fault}")
         station = names.reshape(-1)[station]
-    return station.astype(str)
+    return _as_sheet(source, columns if station is None else {**columns, "station": station.astype(str)})
 
 
-def _checked(queries: QueryPlaces) -> QueryPlaces:
-    """Refuse places with a coordinate that is not finite, and degrees that are not on Earth."""
-    for end, where in queries.ends.items():
-        names = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
-        values = where.all()
-        wrong = np.argwhere(~np.isfinite(values))
-        if len(wrong):
-            row, axis = wrong[0]
-            fault = f"{names[axis]} of the {ENDS[end]} is {values[row, axis]}; expected a finite number"
-            raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
-        # On Earth before anything is projected: 91 degrees of latitude have finite metres too.
-        off_earth = bad_degrees(*where.across.T) if where.degrees else None
-        if off_earth is not None:
-            raise DataError(f"{queries.source}, {queries.rows[off_earth[0]]}: {off_earth[1]}")
-    return queries
+def _as_sheet(source: str, columns: Mapping[str, np.ndarray | None]) -> Sheet:
+    """A table of arrays (n,), or () of one value for all rows."""
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    count = next((len(values) for values in arrays.values() if values.ndim), 1)
+    if not count:
+        raise DataError(f"{source}: no rows; expected a place or more")
+    for name, values in arrays.items():
+        if values.shape not in ((), (count,)):
+            raise DataError(f"{source}, {name}: expected {count} values, one a row, found {values.shape}")
+    frame = pd.DataFrame({name: np.broadcast_to(values, count) for name, values in arrays.items()})
+    return Sheet(source, frame, tuple(f"row {i}" for i in range(count)), problems=Problems(source))

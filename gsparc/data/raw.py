@@ -14,8 +14,8 @@ import tempfile
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -76,14 +76,11 @@ def read_raw(path: str | Path) -> Raw:
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path)
-    if path.suffix.lower() in HDF5_SUFFIXES:
-        return _read_hdf5(path)
-    if path.suffix.lower() == ".mat":
-        return _read_mat(path)
-    suffix = path.suffix or "no ending"
-    raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
+    readers = {".npz": _read_npz, ".mat": _read_mat, **dict.fromkeys(HDF5_SUFFIXES, _read_hdf5)}
+    if path.suffix.lower() not in readers:
+        suffix = path.suffix or "no ending"
+        raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
+    return readers[path.suffix.lower()](path)
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
@@ -172,14 +169,13 @@ def stored_archive(path: Path) -> BytesIO:
             entries = archive.infolist()
             names = {entry.filename for entry in entries}
             stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
-            size = sum(entry.file_size for entry in entries)
-            wrong = None
-            if not any(name.endswith("/data.pkl") for name in names):
-                wrong = "an archive, but not a gsparc checkpoint"
-            elif len(names) < len(entries):
-                wrong = "damaged (an entry is there twice)"
-            elif not stored or size > path.stat().st_size:
-                wrong = "damaged (entries are compressed, or larger than the file)"
+            stored &= sum(entry.file_size for entry in entries) <= path.stat().st_size
+            faults = {
+                "an archive, but not a gsparc checkpoint": not any(n.endswith("/data.pkl") for n in names),
+                "damaged (an entry is there twice)": len(names) < len(entries),
+                "damaged (entries are compressed, or larger than the file)": not stored,
+            }
+            wrong = next((fault for fault, holds in faults.items() if holds), None)
             for entry in () if wrong else entries:
                 copy.writestr(entry.filename, archive.read(entry))
     except Exception as error:  # whatever a damaged archive raises
@@ -194,12 +190,10 @@ def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
     try:
-        archive = is_archive(path)
+        if not is_archive(path):  # numpy would take anything else for a pickle and speak of that
+            raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({reason(error)})") from None
-    if not archive:
-        # numpy would take anything else for a pickle and speak of that.
-        raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     refuse_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -218,11 +212,9 @@ def _read_npz(path: Path) -> Raw:
         return Raw(arrays)
     try:
         attributes = json.loads(str(text))
-        if not isinstance(attributes, dict):
-            raise TypeError(f"found a {type(attributes).__name__}")
-        units = attributes.pop("units", {})
+        units = attributes.pop("units", {}) if isinstance(attributes, dict) else None
         if not isinstance(units, dict):
-            raise TypeError("units is not a table")
+            raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is no table")
     except (ValueError, TypeError, RecursionError) as error:
         raise DataError(f"{path}, attributes: expected a JSON table as text ({reason(error)})") from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
@@ -239,31 +231,33 @@ def _stated_npz(path: Path) -> Stated:
     return stated
 
 
-def _stated_hdf5(file: h5py.File) -> Stated:
-    """Of each dataset; what lies in one piece takes nothing that is not in the file."""
-    return {
-        str(_plain(name)): (one.shape, 0 if one.id.get_offset() else one.nbytes)
-        for name, one in file.items()
-        if isinstance(one, h5py.Dataset) and one.size is not None
-    }
+@contextmanager
+def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
+    """An HDF5 file and its datasets by name, none larger than it can hold."""
+    fault = read_error(path)
+    if fault is not None:
+        raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
+    with h5py.File(path, "r") as file:
+        # h5py hands out bytes when a name is not UTF-8
+        items = {str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)}
+        known = {name: one for name, one in items.items() if one.size is not None}
+        # What lies in one piece takes nothing that is not in the file.
+        stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in known.items()}
+        refuse_sizes(path, stated, to_disk)
+        yield file, items
 
 
 def _read_hdf5(path: Path) -> Raw:
     arrays, units, name = {}, {}, "the file"
-    fault = read_error(path)
-    if fault is not None:
-        raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     try:
-        with h5py.File(path, "r") as file:
-            refuse_sizes(path, _stated_hdf5(file), to_disk=True)
-            for key, item in file.items():
-                name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
-                if isinstance(item, h5py.Dataset):
-                    text = h5py.check_string_dtype(item.dtype)
-                    plain = not text and not item.dtype.names
-                    arrays[name] = on_disk(item) if plain and is_big(item) else _values(item, fixed=True)
-                    if "units" in item.attrs:
-                        units[name] = _plain(item.attrs["units"])
+        with _datasets(path, to_disk=True) as (file, items):
+            for name, item in items.items():
+                plain = not h5py.check_string_dtype(item.dtype) and not item.dtype.names
+                arrays[name] = on_disk(item) if plain and is_big(item) else _values(item, fixed=True)
+                if "units" in item.attrs:
+                    units[name] = _plain(item.attrs["units"])
+                if _plain(item.attrs.get("MATLAB_class")) == "char":  # columns first, as all of MATLAB's
+                    arrays[name] = np.array([*map(chr, arrays[name].T.ravel())])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
     except DataError:
         raise
@@ -284,9 +278,6 @@ def _read_mat(path: Path) -> Raw:
     """Arrays of a MATLAB file without their axes of length 1, text as attributes."""
     if h5py.is_hdf5(path):  # version 7.3 writes HDF5, the axes of arrays in reverse
         arrays = {name: array.T for name, array in _read_hdf5(path).arrays.items()}
-        with h5py.File(path, "r") as file:
-            text = {name for name in arrays if _plain(file[name].attrs.get("MATLAB_class")) == "char"}
-        arrays |= {name: np.array([*map(chr, arrays[name].ravel())]) for name in text}
     else:
         try:
             content = loadmat(path)
@@ -427,13 +418,8 @@ def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
 
 
 def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
-    fault = read_error(path)
-    if fault is not None:
-        raise DataError(f"{path}: damaged ({fault})")
-    with h5py.File(path, "r") as file:
-        refuse_sizes(path, _stated_hdf5(file))
-        items = [(str(name), item) for name, item in file.items() if isinstance(item, h5py.Dataset)]
-        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items}
+    with _datasets(path) as (_, items):
+        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items.items()}
 
 
 def _of_netcdf(array: np.ndarray, fill: Any) -> np.ndarray:

@@ -192,18 +192,16 @@ class Site:
     @property
     def array_problem(self) -> str | None:
         """Why these spectra cannot be modelled through the receive array; None when they can."""
-        if self.kind != "spectrum" or self.grid is None:
-            return f"targets are {self.kind}, not spectra on a grid"
-        # Plane waves at fixed elements: with a moving array each row would have another manifold.
-        if self.static_end != "rx":
-            return "the receiver moves; its array must be static"
-        if self.array is None or len(self.array) < 2:
-            return "the dataset declares no antenna array"
-        if not np.ptp(self.array, axis=0).any():
-            return "all antennas of the declared array are at one place"
-        if self.wavelength is None:
-            return "the carrier is unknown"
-        return None
+        array = np.zeros((0, 3)) if self.array is None else self.array
+        faults = {
+            f"targets are {self.kind}, not spectra on a grid": self.kind != "spectrum" or self.grid is None,
+            # Plane waves at fixed elements: with a moving array each row would have another manifold.
+            "the receiver moves; its array must be static": self.static_end != "rx",
+            "the dataset declares no antenna array": len(array) < 2,
+            "all antennas of the declared array are at one place": not (array != array[:1]).any(),
+            "the carrier is unknown": self.wavelength is None,
+        }
+        return next((fault for fault, holds in faults.items() if holds), None)
 
     def array_geometry(self) -> tuple[np.ndarray, SphereGrid, float]:
         """Return the array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""

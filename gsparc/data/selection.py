@@ -28,7 +28,7 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample, station or path, and how many axes they then have.
 ROW_AXES, STATION_AXES, PATH_AXES = axes_from("S"), axes_from("T"), axes_from("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
-ALWAYS = ("mask", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
+ALWAYS = ("mask", "place", *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
 
@@ -39,15 +39,12 @@ def _listed(value: Any) -> Any:
 
 def _are_names(value: Any) -> bool:
     names = _listed(value)
-    if not isinstance(names, Sequence) or not names:
-        return False
-    return all(isinstance(name, str | int) and not isinstance(name, bool) for name in names)
+    return isinstance(names, Sequence) and bool(names) and all(type(name) in (str, int) for name in names)
 
 
 def _are_steps(value: Any) -> bool:
-    rows = [_listed(firsts) for firsts in value.values()] if isinstance(value, Mapping) else [()]
-    lists = all(isinstance(firsts, Sequence) and firsts for firsts in rows)
-    return lists and all(type(row) is int for firsts in rows for row in firsts)
+    rows = map(_listed, value.values()) if isinstance(value, Mapping) else [()]
+    return all(isinstance(part, Sequence) and part and all(type(row) is int for row in part) for part in rows)
 
 
 STEPS = or_null(Limit("first rows after steps by station, like {roof: [1162]},", _are_steps))
@@ -116,14 +113,11 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
     part = take_stations(raw, chosen, source)
     part.arrays.setdefault("station_name", chosen.astype(str))  # what numbers call them does not change
-    if "station" in part.arrays:
-        of_row = raw.arrays["station"]
-        rows = np.flatnonzero(np.isin(of_row, chosen))
-        _check_rows(rows, "dataset.stations", source)
-        part = _rows_of(part, rows, source)
-        part.arrays["station"] = np.searchsorted(chosen, of_row[rows])
-        note += f", with them {len(of_row) - len(rows)} of {len(of_row)} rows"
-    return Noted(part, (note,))
+    if "station" not in part.arrays:
+        return Noted(part, (note,))
+    part, more = _select(part, np.isin(raw.arrays["station"], chosen), "dataset.stations", source)
+    part.arrays["station"] = np.searchsorted(chosen, part.arrays["station"])
+    return Noted(part, (note, *more))
 
 
 def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Noted:
@@ -151,21 +145,17 @@ def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Noted:
     name, option = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
     if name not in ("rssi", "rssi_db"):
         raise DataError(f"{option}: {source} holds {name}; expected powers, rssi or rssi_db")
-    values = raw.arrays[name]
+    values, measured = raw.arrays[name], measured_links(raw, source)
     with np.errstate(divide="ignore", invalid="ignore"):
         # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
-        low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
-    mask = raw.arrays.get("mask")
-    if mask is not None and mask.shape != low.shape:
-        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {mask.shape}")
-    low &= True if mask is None else mask.astype(bool)
+        low = np.asarray(measured & ((10 * np.log10(values) if name == "rssi" else values) < min_rssi_db))
     if low.ndim == 1:
-        return _select(raw, ~low, option, source)
+        return _select(raw, np.logical_not(low), option, source)
     # A wide file cannot leave out single links: they are marked as not measured.
-    measured = ~low & measured_links(raw, source)
+    measured[low] = False
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{option}: {int(low.sum())} links left out",) if low.any() else ()
-    rest = _select(marked, measured.reshape(len(measured), -1).any(axis=1), option, source)
+    rest = _select(marked, np.asarray(measured.reshape(len(measured), -1).any(axis=1)), option, source)
     return Noted(rest.raw, (*links, *rest.notes))
 
 
@@ -194,7 +184,7 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int, stations: int | None
     """
     part = dict(arrays)
     for name, array in arrays.items():
-        if _per_row(name, array, stations) and array.ndim and len(array) == count:
+        if _of_rows(name, array, count, stations):
             part[name] = take(array, rows)
         elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
             # Rows may repeat or be gone: a row of the split then stands in several places, or in none.
@@ -224,11 +214,11 @@ def take_stations(raw: Raw, stations: np.ndarray, source: str | Path) -> Raw:
     Raises:
         DataError: a measurement has other columns than there are stations.
     """
-    count = station_count(raw)
+    count, rows = station_count(raw), row_count(raw, source)
     assert count is not None
     arrays = dict(raw.arrays)
     for name, array in raw.arrays.items():
-        if per_station(name, array, count):
+        if _of_stations(name, array, rows, count):
             arrays[name] = array[stations]
         elif name in (*MEASUREMENTS, "mask") and "station" not in arrays:
             if array.ndim < 2 or array.shape[1] != count:
@@ -297,25 +287,27 @@ def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
     """Tell where the measurement says something: NaN is missing, or, with a sensitivity, not heard.
 
     Raises:
-        DataError: the file holds no measurement.
+        DataError: the file holds no measurement, or a mask of another shape.
     """
-    values, mask = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
+    name, mask = _measurement(raw, source), raw.arrays.get("mask")
+    values = raw.arrays[name]
+    if mask is not None and mask.shape != values.shape:
+        raise DataError(f"{source}, mask: expected shape {values.shape} as {name}, found {mask.shape}")
     if mask is not None:
         return mask.astype(bool)
     return np.ones(values.shape, bool) if "sensitivity_db" in raw.arrays else ~np.isnan(values)
 
 
-def per_station(name: str, array: np.ndarray, count: int) -> bool:
-    """Tell whether an array of a file has an entry for each of `count` stations."""
-    return array.ndim in STATION_AXES.get(name, ()) and len(array) == count
+def _of_stations(name: str, array: np.ndarray, rows: int, stations: int | None) -> bool:
+    """Whether an array has an entry for each station; where rows are as many, carriers are of rows."""
+    fits = array.ndim in STATION_AXES.get(name, ()) and len(array) == stations
+    return fits and not (name == "carrier_hz" and rows == stations)
 
 
-def _per_row(name: str, array: np.ndarray, stations: int | None) -> bool:
-    """Whether an array has a row per sample, by its name, its axes and how many stations there are."""
-    # Frequencies may be of stations or of rows: where the counts agree they are of stations.
-    if name == "carrier_hz" and array.ndim and len(array) == stations:
-        return False
-    return name in ALWAYS or array.ndim in ROW_AXES.get(name, ())
+def _of_rows(name: str, array: np.ndarray, rows: int, stations: int | None) -> bool:
+    """Whether an array has an entry for each row, by its name, its axes and how many there are."""
+    known = name in ALWAYS or array.ndim in ROW_AXES.get(name, ())
+    return known and array.shape[:1] == (rows,) and not _of_stations(name, array, rows, stations)
 
 
 def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -324,23 +316,14 @@ def _runs(first: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 
 def _select(raw: Raw, keep: np.ndarray, option: str, source: str | Path) -> Noted:
-    rows = np.flatnonzero(keep)
-    _check_rows(rows, option, source)
-    if len(rows) == len(keep):
-        return Noted(raw)
-    note = f"{option}: {len(keep) - len(rows)} of {len(keep)} rows left out"
-    return Noted(_rows_of(raw, rows, source), (note,))
-
-
-def _rows_of(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
-    count = row_count(raw, source)
-    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
-    return replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
-
-
-def _check_rows(rows: np.ndarray, option: str, source: str | Path) -> None:
+    rows, count = np.flatnonzero(keep), len(keep)
     if len(rows) < FEWEST:
         raise DataError(f"{option}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")
+    if len(rows) == count:
+        return Noted(raw)
+    named = {"row_name": numbered_rows(count), **raw.arrays}  # numbers stay the file's
+    part = replace(raw, arrays=take_rows(named, rows, count, station_count(raw)))
+    return Noted(part, (f"{option}: {count - len(rows)} of {count} rows left out",))
 
 
 def split_stations(raw: Raw, steps: Mapping[str, Sequence[int]], source: str | Path) -> Raw:

@@ -3,38 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
-from gsparc.data.blocks import evenly
-from gsparc.data.errors import DataError, reason
-from gsparc.data.files import whole_file
+from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
-from gsparc.data.links.stations import numbered
 from gsparc.data.schema import TrainTest
-
-log = logging.getLogger(__name__)
+from gsparc.data.spacing import far_apart, far_from, path_order, square_of, tenth
 
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
 CORNERS = ("--", "-+", "+-", "++")
-# Rows form a path while their median step is below this many nearest-neighbour distances.
-PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
-NEAR = 0.01  # of the usual step: places nearer than this are visits of one
-FEWEST_PLACES, SAMPLE = 10, 10_000  # that tell a usual step; more tell nothing more
-# Large odd factors: cells become numbers, which sort much faster than rows.
-_ODD = [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
-MIXING = 2**62 + np.array(_ODD)
-EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
 @dataclass(frozen=True)
@@ -147,6 +130,12 @@ class SplitSettings(Checked):
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
             ROWS.check("leave_out", self.leave_out)
 
+    def together(self, count: int) -> int:
+        """Return how many of `count` stations, or runs, are held out together; 0: each in its turn."""
+        if self.name == "runs":
+            return max(round(self.test_fraction * count), 1)
+        return self.leave_out if isinstance(self.leave_out, int) else 0
+
 
 @dataclass(frozen=True)
 class FileSettings(Checked):
@@ -242,79 +231,6 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
     return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
 
 
-def usual_step(positions: np.ndarray) -> float:
-    """Return the median distance [m] from a place (n, D) to the nearest other; 0 where too few tell it.
-
-    Looked for from coarse to fine, as all places may have been visited again: what lies in a cell is one, and
-    the first step that is ten cells long stands.
-
-    >>> round(usual_step(np.c_[np.arange(20.0), np.zeros(20)]), 3)  # along a line, every metre
-    1.0
-    """
-    side = extent = float(np.ptp(positions, axis=0).max())
-    while side > 1e-12 * extent:
-        # Cells of the current side first, so that visits of one place do not make its step zero.
-        places, step = positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]], 0.0
-        if len(places) >= FEWEST_PLACES:
-            some = places[evenly(len(places), SAMPLE)]
-            step = float(np.median(cKDTree(places).query(some, k=2)[0][:, 1]))
-        if step >= 10 * side:
-            return step
-        side = min(step or side, side) / 10
-    return 0.0
-
-
-def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
-    """Return the place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
-
-    >>> line = np.c_[np.arange(20.0), np.zeros(20)]  # every metre, and once more 1 mm beside it
-    >>> visits(np.r_[line, line + 1e-3])[[0, 1, 20, 21]].tolist()
-    [0, 1, 0, 1]
-
-    Args:
-        positions: (S, D) [m].
-        place: (S,) of rows known to be of one place; returned as it is where no others are.
-    """
-    first = which = np.arange(len(positions))
-    if place is not None:
-        _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    places = positions[first]
-    reach = NEAR * usual_step(places)
-    if reach == 0:
-        return place
-    # A cell's diagonal is a quarter of `reach`: two representatives are at most 1.5 of it apart.
-    joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)  # all nearer than `reach`
-    return place if len(np.unique(joined)) == len(places) else numbered(joined[which.reshape(-1), None])
-
-
-def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
-    """A number (n,) that places (n, D) share in a cell, or where one of each cell is within `reach` [m].
-
-    Cells first: thousands of visits of one place would be millions of pairs.
-    """
-    corner = np.floor((places - places.min(axis=0)) / cell).astype(np.int64)
-    # The sums wrap around on overflow, as a hash does: two cells hardly ever share a number.
-    _, first, which = np.unique(corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True)
-    one, two = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
-    graph = coo_array((np.ones(len(one)), (one, two)), (len(first), len(first)))
-    return np.asarray(connected_components(graph)[1][which.reshape(-1)])
-
-
-def tenth(floor: np.ndarray) -> float:
-    """Return the side [m] of squares of which ten hold the longer side of places (n, 2)."""
-    return float(np.ptp(floor, axis=0).max()) / 10 * (1 + 2 * EDGE)
-
-
-def square_of(floor: np.ndarray, side: float) -> np.ndarray:
-    """Return the number (n,) of the square of `side` [m] that each place (n, 2) is in, from zero.
-
-    >>> square_of(np.array([[0.5, 0.5], [0.9, 0.1], [3.5, 0.5]]), side=1.0)
-    array([0, 0, 1])
-    """
-    # Counted from zero, which `split_for` puts at the lowest place of the whole campaign.
-    return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
-
-
 def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
     """Return the rows (n,) int64 of `rows` that `leave_out` names, `outliers` (n,) being those of that name.
 
@@ -337,59 +253,6 @@ def without(split: Split, absent: np.ndarray) -> Split:
     return Split(split.name, folds, indices_hash(folds))
 
 
-def path_order(positions: np.ndarray) -> np.ndarray:
-    """Return the rows (S,) in the order of the measuring path.
-
-    Rows taken one after the other keep their order. Where consecutive rows are far apart compared with
-    nearest neighbours (a shuffled file, random drops) there is no path: rows are ordered along the
-    longest side of the box, so that a stretch becomes a slab.
-
-    >>> path_order(np.array([[0.0, 0, 0], [9, 0, 0], [1, 0, 0], [8, 0, 0], [2, 0, 0]]))  # no path: along x
-    array([0, 2, 4, 3, 1])
-    """
-    rows = np.arange(len(positions))
-    if len(positions) < 3:
-        return rows
-    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-    nearest = np.median(cKDTree(positions).query(positions, k=2)[0][:, 1])
-    if step <= PATH_STEP_RATIO * nearest:
-        return rows
-    # Stable, so that places with equal coordinates stay in the order of the file.
-    longest = int(np.argmax(np.ptp(positions, axis=0)))
-    return np.argsort(positions[:, longest], kind="stable")
-
-
-def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
-    """Return those `rows` that are more than `distance` [m] away from all `others` (rows).
-
-    >>> line = np.arange(5.0)[:, None]
-    >>> far_from(line, np.array([0, 1, 2]), np.array([4]), distance=2.5)
-    array([0, 1])
-    """
-    if len(rows) == 0 or len(others) == 0:
-        return rows
-    return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
-
-
-def far_apart(
-    positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
-) -> np.ndarray:
-    """Return a largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m].
-
-    >>> line = np.arange(9.0)[:, None]
-    >>> rows = far_apart(line, np.arange(9), distance=2.0, seed=[0])
-    >>> bool(np.diff(rows).min() > 2)
-    True
-    """
-    tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
-    subset = []
-    for i in np.random.default_rng(seed).permutation(len(rows)):
-        if free[i]:
-            subset.append(i)
-            free[tree.query_ball_point(positions[rows[i]], distance)] = False
-    return rows[np.sort(subset)]
-
-
 def indices_hash(folds: tuple[Fold, ...]) -> str:
     """Return the SHA-256 of all indices of all folds."""
     digest = hashlib.sha256()
@@ -398,52 +261,6 @@ def indices_hash(folds: tuple[Fold, ...]) -> str:
             # The length first: moving a row from one part to the next changes the hash.
             digest.update(len(part).to_bytes(8, "little") + part.astype("<i8").tobytes())
     return digest.hexdigest()
-
-
-def write_split(
-    path: str | Path, split: Split, rows: int, dataset_sha256: str = "", run_id: str | None = None
-) -> None:
-    """Store a split of `rows` rows as a JSON index file (atomically), with the run that made it."""
-    facts = {"schema": 1, "name": split.name, "rows": rows, "dataset_sha256": dataset_sha256}
-    facts |= {} if run_id is None else {"run_id": run_id}
-    folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
-    content = {**facts, "sha256": split.sha256, "folds": folds}
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
-
-
-def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
-    """Read an index file for a dataset of `rows` rows; warns when it was made for other data.
-
-    Raises:
-        DataError: not an index file, made for another number of rows, edited, or with overlapping parts.
-    """
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        folds = tuple(
-            Fold(*(np.array(f[k], dtype=np.int64).reshape(-1) for k in ("train", "val", "test")))
-            for f in content["folds"]
-        )
-        name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
-    # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
-    if stored_rows != rows:
-        raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
-    for i, fold in enumerate(folds):
-        every = np.concatenate([fold.train, fold.val, fold.test])
-        if len(np.unique(every)) != len(every):
-            raise DataError(f"{path}: fold {i} names a row twice (train, val and test must be disjoint)")
-        if len(every) and (every.min() < 0 or every.max() >= rows):
-            raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
-    if not folds or indices_hash(folds) != stored_hash:
-        raise DataError(f"{path}: the indices do not match their sha256; the file was edited or damaged")
-    if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
-        log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
-    return Split(name, folds, stored_hash)
 
 
 def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
@@ -497,9 +314,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         raise DataError(f"split={name}: these measurements have one {name[:-1]}; take split=random or blocks")
     unit = np.unique(unit, return_inverse=True)[1].reshape(-1)
     count = int(unit.max()) + 1
-    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
-    if name == "runs":
-        together = max(round(settings.test_fraction * count), 1)
+    together = settings.together(count)
     least = 2 if name == "stations" else 1
     if count - max(together, 1) < least:
         remain = "two at least must remain" if least == 2 else "one must remain"

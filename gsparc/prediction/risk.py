@@ -18,7 +18,7 @@ from scipy.special import betainc
 from scipy.stats import binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
-from gsparc.data.splits import far_apart
+from gsparc.data.spacing import far_apart
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)

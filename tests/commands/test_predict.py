@@ -271,16 +271,16 @@ def test_tables_that_hold_no_places_are_refused(valley, tmp_path, name):
 
 PLACE = np.array([47.0, 47.001])
 BAD_ARRAYS = {
-    "nan": ({"latitude": PLACE * [1, np.nan]}, r"row 1: latitude of the receiver is nan"),
-    "beyond": ({"latitude": PLACE + np.array([0, 90])}, r"row 1: latitude 137\.001 is outside"),
-    "lengths": ({"latitude": PLACE[:1]}, r"have shapes \(1,\) and \(2,\)"),
-    "heights": ({"rx_height": np.ones(3)}, r"rx_height: expected shape .* found .3,"),
+    "nan": ({"latitude": PLACE * [1, np.nan]}, r"'latitude', row 1: no value"),
+    "beyond": ({"latitude": PLACE + np.array([0, 90])}, r"row 1: 137\.001: latitude is outside"),
+    "lengths": ({"latitude": PLACE[:1]}, r"longitude: expected 1 values, one a row, found .2,"),
+    "heights": ({"rx_height": np.ones(3)}, r"z: expected 2 values, one a row, found .3,"),
     "text": ({"longitude": np.array(["a", "b"])}, r"longitude: expected real numbers, found dtype <U1"),
-    "stations": ({"station": np.zeros(3, int)}, r"station: expected 2 names or numbers"),
+    "stations": ({"station": np.zeros(3, int)}, r"station: expected 2 values"),
     "number": ({"station": np.array([0, 7]), "station_name": np.array(["a"])}, r"row 1: 7 is none of the 1"),
-    "both": ({"rx_position": np.zeros((2, 3))}, r"rx_position and latitude both say where"),
+    "both": ({"rx_position": np.zeros((2, 3))}, r"found rx_position and latitude"),
     "none": ({"latitude": PLACE[:0], "longitude": PLACE[:0], "rx_height": 1.0}, r"no rows"),
-    "alone": ({"longitude": None}, r"no places of the receiver; expected latitude and longitude"),
+    "alone": ({"longitude": None}, r"expected rx_position, or latitude and longitude; found lat"),
 }
 
 

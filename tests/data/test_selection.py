@@ -64,7 +64,7 @@ def test_stations_of_a_long_file_are_rows_and_numbered_anew():
     rows = np.isin(raw.arrays["station"], [1, 3])
     assert np.array_equal(kept.raw.arrays["rssi_db"], raw.arrays["rssi_db"][rows], equal_nan=True)
     assert np.array_equal(kept.raw.arrays["station"], np.tile([0, 1], 15))
-    assert "with them 30 of 60 rows" in kept.notes[0]
+    assert kept.notes[1] == "dataset.stations: 30 of 60 rows left out"
 
 
 @pytest.mark.parametrize("make", [channels, long])
@@ -84,6 +84,14 @@ def test_what_belongs_to_a_station_goes_with_it():
     kept = keep_stations(Raw({**wide().arrays, **more}), [2, 0], "file").raw.arrays
     assert kept["sensitivity_db"].tolist() == [0, 2] and kept["carrier_hz"].tolist() == [1e9, 1e9 + 2]
     assert kept["mask"].shape == (15, 2)
+
+
+def test_carriers_of_as_many_rows_as_stations_were_taken_by_station():
+    """Read whole they are of rows; with a station left out, rows had those of other rows."""
+    first = {name: long().arrays[name][:4] for name in ("tx_position", "rssi_db")}
+    of_rows = {"station": np.array([0, 0, 1, 2]), "carrier_hz": 1e9 + np.arange(4.0)}
+    kept = keep_stations(Raw({**long().arrays, **first, **of_rows}), [0, 2], "file").raw.arrays
+    assert kept["station"].tolist() == [0, 0, 1] and (kept["carrier_hz"] - 1e9).tolist() == [0, 1, 3]
 
 
 def test_runs_are_rows():

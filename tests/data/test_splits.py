@@ -10,7 +10,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import load, split_for
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, visits, write_split
+from gsparc.data.spacing import path_order, visits
+from gsparc.data.split_files import read_split, write_split
+from gsparc.data.splits import SplitSettings, make_split
 
 
 def _walk(rows=400, seed=0):

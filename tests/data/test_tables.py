@@ -251,7 +251,7 @@ SPOILT = {
     "dBm or watts": ("x,y,power\n1,2,3\n2,3,4\n", {}, "column 'power': no value below 0: dBm or W, per cent"),
     "a misspelt column": (PLAIN, {"rssi_db": "rsi"}, "dataset.columns.rssi_db=rsi: drive.csv has no such column; "
                           "did you mean 'rssi'?"),
-    "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean rssi_db?"),
+    "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean 'rssi_db'?"),
     "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW: rssi_db needs"),
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
+from gsparc.data.spacing import between
 from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning, words
 
 log = logging.getLogger(__name__)
@@ -118,20 +119,10 @@ def allowed(data: Measurements, align: str) -> Measurements:
             return data
         freedom = found.freedom
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
-        if (apart := _places_apart(data)) > IN_LINE:
-            log.warning(
-                "places are %.3g wavelengths apart: neighbours tell levels, not the shape over subcarriers",
-                apart,
-            )  # fmt: skip
+        if (apart := between(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
+            what = "neighbours tell levels, not the shape over subcarriers"
+            log.warning("places are %.3g wavelengths apart: %s", apart, what)
     return replace(data, site=replace(data.site, freedom=freedom))
-
-
-def _places_apart(data: Measurements) -> float:
-    """Median distance from a place to the next other one [wavelengths]."""
-    places = np.unique(data.moving, axis=0)
-    if len(places) < 2 or data.site.wavelength is None:
-        return 0.0
-    return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) / data.site.wavelength
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

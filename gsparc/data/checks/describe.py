@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsparc.data.checks import outliers
 from gsparc.data.checks.coherence import coherence
 from gsparc.data.errors import some
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
+from gsparc.data.spacing import between
 from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
@@ -18,8 +18,11 @@ LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
-    """Return (topic, sentence) pairs about a dataset."""
-    site, tones = data.site, data.site.subcarriers_hz
+    """Return (topic, sentence) pairs about a dataset; topics of what it has none of are left out."""
+    site, phases, own, error = data.site, coherence(data), data.release_split, data.site.convergence_error
+    tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
+    weak, strong = (int((data.side(np.arange(len(data))) == side).sum()) for side in (1, -1))
+    paths, scale = data.directions, site.target_scale
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
@@ -29,34 +32,23 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         *(("units?", hint) for hint in suspicious_values(data)),
         *(("outliers?", warning) for warning in outliers.warnings(data)),
         ("carrier", _carrier(site)),
-    ]
-    if tones is not None and len(tones) > 1:
-        lines.append(("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz"))
-    if site.grid is not None:
-        lines.append(("grid", _grid(site.grid)))
-    if site.array is not None:
-        lines.append(("array", f"{len(site.array)} receive antennas"))
-    if site.target_scale != 1:
-        lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
-    if data.censored is not None:
-        counts = [f"{(data.censored == side).sum()} of {len(data)} powers were too" for side in (1, -1)]
-        lines.append(("censored", f"{counts[0]} weak to be heard, {counts[1]} strong to be measured"))
-    if data.run is not None:
-        lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
-    if (phases := coherence(data)) is not None:
-        lines.append(("phases", str(phases)))
-    if data.mask is not None and data.censored is None:
-        lines.append(("mask", f"{data.mask.mean():.1%} of the entries were measured"))
-    if data.directions is not None:
-        lines.append(("directions", f"{sum(map(len, data.directions))} directions of arrival"))
-    if data.release_split is not None:
-        train, test = data.release_split
-        lines.append(("split", f"its own: {len(train)} rows to train, {len(test)} to test"))
-    lines.append(("split?", proposal(data)))
-    if site.convergence_error is not None:
-        lines.append(("convergence", f"solver error (NMSE between two seeds) {site.convergence_error:.3g}"))
-    lines.append(("sha256", site.sha256))
-    return lines
+        ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
+        ("grid", "" if site.grid is None else _grid(site.grid)),
+        ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
+        ("scale", "" if scale == 1 else f"stored targets are the measurements divided by {scale:.4g}"),
+        ("censored", f"of {len(data)} powers {weak} were too weak, {strong} too strong to be measured"
+         if data.censored is not None else ""),
+        ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
+        ("phases", "" if phases is None else str(phases)),
+        ("mask", f"{data.mask.mean():.1%} of the entries were measured"
+         if data.mask is not None and data.censored is None else ""),
+        ("directions", "" if paths is None else f"{sum(map(len, paths))} directions of arrival"),
+        ("split", "" if own is None else f"its own: {len(own[0])} rows to train, {len(own[1])} to test"),
+        ("split?", proposal(data)),
+        ("convergence", "" if error is None else f"solver error (NMSE between two seeds) {error:.3g}"),
+        ("sha256", site.sha256),
+    ]  # fmt: skip
+    return [(topic, sentence) for topic, sentence in lines if sentence]
 
 
 def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
@@ -96,13 +88,12 @@ def _targets(data: Measurements) -> str:
 
 def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
-    if len(positions) < 2:
+    different, counts = np.unique(positions, axis=0, return_counts=True)
+    if len(different) < 2:
         return "one place alone"
-    distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
-    text = f"the nearest other place is {np.median(distance):.3g} m away (median)"
-    if wavelength is not None:
-        text += f", {np.median(distance) / wavelength:.2g} wavelengths"
-    same = int((distance == 0).sum())
+    distance, same = between(different), int(counts[counts > 1].sum())
+    text = f"the nearest other place is {distance:.3g} m away (median)"
+    text += "" if wavelength is None else f", {distance / wavelength:.2g} wavelengths"
     return text + (f"; {same} rows share their place with another" if same else "")
 
 
@@ -110,31 +101,29 @@ def _static(site: Site) -> str:
     """Which end stands still, and where in the world."""
     if site.static_end is None:
         return "neither end"
-    end = ENDS[site.static_end]
-    if site.stations is not None and len(site.stations) == 1 and site.static_position is not None:
-        place = site.stations.position[0] + site.origin
-        return f"the {end}, {site.stations.name[0]}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
-    if site.stations is not None:
-        known = site.stations.position[np.isfinite(site.stations.position).all(axis=1)]
-        lost = len(site.stations) - len(known)
-        box = f" in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(known, axis=0))} m" if len(known) else ""
-        box += f", {lost} of them at unknown places" if lost else ""
-        return f"the {end}, {len(site.stations)} stations{box}: {some(site.stations.name, 4)}"
+    end, stations = ENDS[site.static_end], site.stations
+    if stations is not None and (len(stations) > 1 or site.static_position is None):
+        known = stations.position[np.isfinite(stations.position).all(axis=1)]
+        lost = len(stations) - len(known)
+        where = _box(known) if len(known) else ""
+        where += f", {lost} of them at unknown places" if lost else ""
+        return f"the {end}, {len(stations)} stations{where}: {some(stations.name, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
-    return f"the {end}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
+    name = "" if stations is None else f" {stations.name[0]},"
+    return f"the {end},{name} at ({', '.join(f'{x:.3f}' for x in place)}) m"
 
 
 def _moving(data: Measurements) -> str:
-    ends = {"the receiver": data.rx_position, "the transmitter": data.tx}
-    site = data.site
-    if site.static_end is not None:
-        ends = {f"the {ENDS[site.moving_end]}": data.moving}
-    return "; ".join(
-        f"{end}, in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
-        for end, places in ends.items()
-    )
+    ends = {"receiver": data.rx_position, "transmitter": data.tx}
+    if data.site.static_end is not None:
+        ends = {ENDS[data.site.moving_end]: data.moving}
+    return "; ".join(f"the {end},{_box(places)}" for end, places in ends.items())
+
+
+def _box(places: np.ndarray) -> str:
+    return f" in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
 
 
 def suspicious_values(data: Measurements) -> list[str]:
@@ -224,12 +213,11 @@ def side_of_squares(data: Measurements) -> float | None:
 
     None where the places are too few to hold squares of them out.
     """
-    places = np.unique(data.moving[:, :3], axis=0)[:, :2]  # as `split=blocks` cuts squares, of both ends too
-    extent = float(np.ptp(places, axis=0).max()) if len(places) > 1 else 0.0
+    places = data.moving[:, :2]  # as `split=blocks` cuts squares, of both ends too
+    extent = float(np.ptp(places, axis=0).max())
     if extent == 0:
         return None
-    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
-    least = max(extent / 10, APART * apart)
+    least = max(extent / 10, APART * between(places))
     decade = 10 ** np.floor(np.log10(least))
     # At 0.99 a least side of 2.01 m still may be 2 m.
     side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)

@@ -269,60 +269,46 @@ def gaps(levels: LinkLevels) -> list[str]:
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
     where fading makes its edges ragged.
     """
-    names, rows = levels.names, levels.rows
-    long: dict[tuple[str, str], list[str]] = defaultdict(list)
-    lengths: dict[tuple[str, str], int] = {}
-    faint: list[tuple[str, int, float]] = []
-    plain: list[tuple[str, int]] = []
-    silent: list[str] = []
+    names, rows, weakest = levels.names, levels.rows, dict[str, float]()
+    outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
+    silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
     for t in np.unique(levels.station):
-        used = np.flatnonzero(levels.station == t)
+        used, name = np.flatnonzero(levels.station == t), str(names[t])
         level = levels.level_db[used]
         missing = ~np.isfinite(level)
-        if missing.all():
-            silent.append(str(names[t]))
-        if not missing.any() or missing.all():
+        if missing.all() or not missing.any():
+            silent += [name] * bool(missing.all())
             continue
-        floor = float(np.percentile(level[~missing], 1))
-        absent = np.flatnonzero(missing)
-        scattered, around = 0, []
+        weak, weakest[name] = float(np.percentile(level[~missing], 1)) + WEAK_DB, float(level[~missing].min())
+        absent, count, around = np.flatnonzero(missing), 0, list[float]()
         for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
             start, stop = int(piece[0]), int(piece[-1]) + 1
             beside = np.concatenate([level[max(0, start - 3) : start], level[stop : stop + 3]])
             beside = beside[np.isfinite(beside)]
-            weak = bool(len(beside)) and float(np.median(beside)) < floor + WEAK_DB
             ragged = missing[max(0, start - EDGE) : start].any() or missing[stop : stop + EDGE].any()
-            if stop - start >= LONG_GAP and not (weak and ragged):
-                key = (rows[used[start]], rows[used[stop - 1]])
-                long[key].append(str(names[t]))
-                lengths[key] = stop - start
+            if len(piece) >= LONG_GAP and not (ragged and len(beside) and np.median(beside) < weak):
+                outages[rows[used[start]], rows[used[stop - 1]], len(piece)].append(name)
             else:
-                scattered += stop - start
-                around += beside.tolist()
-        often = scattered >= FEW * len(used)
-        if often and around and np.median(around) < floor + WEAK_DB:
-            faint.append((str(names[t]), scattered, float(level[~missing].min())))
-        elif scattered:
-            plain.append((str(names[t]), scattered))
+                count, around = count + len(piece), [*around, *beside]
+        if count:
+            often = count >= FEW * len(used) and len(around) > 0
+            (faint if often and np.median(around) < weak else plain)[name] = count
     warnings = [
-        f"no level in the {lengths[key]} rows from {key[0]} to {key[1]}{_of(who, len(names))}: an outage; "
+        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: an outage; "
         "these rows are not used"
-        for key, who in sorted(long.items(), key=lambda item: -lengths[item[0]])
+        for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
     ]
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
     if faint:
-        count, least = sum(n for _, n, _ in faint), min(v for _, _, v in faint)
-        who = _of([name for name, _, _ in faint], len(names))
         warnings.append(
-            f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
-            f"(at most {np.floor(least):g} dB), and they count as below it; where they have no row, "
-            "dataset.absent=silent"
+            f"{sum(faint.values())} levels missing{_of([*faint], len(names))}, beside the weakest ones: not "
+            f"heard? then give sensitivity_db (at most {np.floor(min(weakest[n] for n in faint)):g} dB), and "
+            "they count as below it; where they have no row, dataset.absent=silent"
         )
     if plain:
-        count = sum(n for _, n in plain)
         warnings.append(
-            f"{count} single levels missing{_of([n for n, _ in plain], len(names))}, few or beside strong "
+            f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}, few or beside strong "
             "ones: lost rather than not heard; they are not used"
         )
     return warnings

@@ -14,12 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, check_positions, rounded_rms
+from gsparc.data.assemble import assemble, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
 from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
+from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import EncoderSettings, encoder_for
+from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, TrainTest
 
 UPLINK = 26  # tones
@@ -162,16 +164,11 @@ def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: Tr
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
     places = _loaded(path, "true positions exist in the stand-in only")
-    if places.dtype.kind not in "biuf":
-        raise DataError(f"{path}: not readable (expected real numbers, found dtype {places.dtype})")
-    places = places.astype(np.float64)
-    if places.shape != (rows, 3):
-        turned = "; transposed?" if places.shape == (3, rows) else ""
-        raise DataError(f"{path}: expected shape ({rows}, 3) [m], found {places.shape}{turned}")
-    problems = Problems(path)
-    check_positions(problems, str(path), places, [f"row {i}" for i in range(rows)])
-    problems.raise_if_any()
-    return places
+    check = Checker(Raw({"rx_position": places}), str(path))
+    known = check.position("rx_position", rows) if check.fits("rx_position", places, (rows, 3)) else None
+    check.problems.raise_if_any()
+    assert known is not None
+    return known
 
 
 class Argos(Release):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from gsparc.data.assemble import FARTHEST, bad_positions
+from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
@@ -18,8 +18,9 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import Several, read_text
 from gsparc.data.own import interpret
+from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched, found
-from gsparc.data.raw import Raw, read_raw
+from gsparc.data.raw import Raw, numbered_rows, read_raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
 from gsparc.data.selection import Selection, select
 
@@ -32,8 +33,7 @@ class Campaign(DataModule):
     Args:
         file: what `raw` reads, one or several tables of the same columns; None: what `gsparc data` fetched.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
-        stations, runs, min_rssi_db, max_rows, level_steps: see `gsparc.data.selection.Selection`.
-        **settings: what `reader` takes besides.
+        **settings: of `gsparc.data.selection.Selection`, and what `reader` takes besides.
     """
 
     choice: ClassVar[str]  # of conf/dataset
@@ -41,6 +41,7 @@ class Campaign(DataModule):
     suffixes: ClassVar[tuple[str, ...]] = ()  # of files of the release
     inside: ClassVar[str] = ""  # pattern of a file that folders of the release hold
     switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
+    hands_on = Selection  # whose settings it takes
     reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
 
     def __init__(
@@ -48,11 +49,6 @@ class Campaign(DataModule):
         file: str | Path | Sequence[str | Path] | None = None,
         name: str | None = None,
         batch_size: int = 16,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
@@ -60,8 +56,8 @@ class Campaign(DataModule):
         one = str(file) if isinstance(file, str | Path) else Several(file)
         whole = isinstance(one, Several) or "://" in one  # a path would make one of two slashes
         self.file = one if whole else Path(one)
-        self.settings = settings
-        self.selection = Selection(stations, runs, min_rssi_db, max_rows, level_steps)
+        part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+        self.settings, self.selection = settings, Selection(**part)
 
     def raw(self) -> Raw:
         """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
@@ -187,8 +183,7 @@ def read_split(folder: Path, count: int | None, problems: Problems, first: int =
     present = [path for path in paths if path.exists()]
     if not present:
         return None
-    if len(present) == 1:
-        absent = next(path for path in paths if path not in present)
+    for absent in {*paths} - {*present}:
         return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
     train, test = (_read_index(path, count, problems, first) for path in paths)
     if train is None or test is None:
@@ -200,24 +195,22 @@ def read_split(folder: Path, count: int | None, problems: Problems, first: int =
 
 def _read_index(path: Path, count: int | None, problems: Problems, first: int) -> np.ndarray | None:
     """Rows (n,) from 0, sorted."""
-    text = problems.attempt(lambda: read_text(path, "missing"))
-    lines: dict[int, int] = {}  # in which each row was named first
-    for number, line in enumerate((text or "").split("\n"), start=1):
-        for word in line.split():
-            where, digits = f"{path}, line {number}", word.removesuffix(".png")
-            if not (digits.isascii() and digits.isdigit() and len(digits) <= LONGEST):
-                problems.add(where, f"expected the number of a row like {first:05d}, found {word!r}")
-            elif count is not None and not first <= int(digits) < count + first:
-                last = count + first - 1
-                problems.add(where, f"index {digits} is out of range; rows are {first} to {last}")
-            elif int(digits) - first in lines:
-                before = lines[int(digits) - first]
-                problems.add(where, f"index {digits} appears twice, first in line {before}")
-            else:
-                lines[int(digits) - first] = number
-    if text is not None and not lines:
+    lines = (problems.attempt(lambda: read_text(path, "missing")) or "").split("\n")
+    words = [(n, word.removesuffix(".png")) for n, line in enumerate(lines, 1) for word in line.split()]
+    plain = [
+        word if word.isascii() and word.isdigit() and len(word) <= LONGEST else "-1" for _, word in words
+    ]
+    rows = np.array(plain, np.int64) - first
+    wrong = (rows < 0) | (rows >= (np.inf if count is None else count))
+    again = ~np.isin(np.arange(len(rows)), np.unique(rows, return_index=True)[1]) & ~wrong
+    expected = f"expected the number of a row like {first:05d}"
+    expected += "" if count is None else f", at most {first + count - 1}"
+    for bad, what in ((wrong, expected), (again, "named before")):
+        named = (f"line {words[i][0]}: {words[i][1][:LONGEST]!r}" for i in np.flatnonzero(bad))
+        problems.add_rows(path, named, what)
+    if not words and path.is_file():
         return problems.add(path, "no usable index in it; expected one number of a row per line")
-    return np.sort(np.array(list(lines), dtype=np.int64)) if lines else None
+    return np.sort(rows) if words and not wrong.any() else None
 
 
 LONGEST = 18  # digits of an index
@@ -232,44 +225,33 @@ class Expected:
         kinds: allowed kinds of NumPy's dtypes, a key of `KIND_WORDS`.
         place: whether rows are coordinates [m], all of which must be finite and on Earth.
         optional: whether the array may be absent.
-        field: of the schema that it is read as; None: the one of its name.
     """
 
     shape: tuple[str | int, ...]
     kinds: str = REAL
     place: bool = False
     optional: bool = False
-    field: str | None = None
 
 
 def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> dict[str, np.ndarray]:
-    """Return arrays of `layout` by field of the schema; the first array with a letter sets its size.
+    """Return arrays of `layout`; the first array with a letter sets its size.
 
     Raises:
         DataError: all that is missing, of another shape or type, or no place, with array and row.
     """
-    problems = Problems(source)
-    sizes: dict[str, tuple[int, str]] = {}
-    for name, expected in layout.items():
-        where, array = f"{source}, {name}", raw.arrays.get(name)
-        if array is None:
-            if not expected.optional:
-                problems.add(where, f"missing; expected {KIND_WORDS[expected.kinds]} {_text(expected.shape)}")
-        elif array.dtype.kind not in expected.kinds:
-            problems.add(where, f"expected {KIND_WORDS[expected.kinds]}, found dtype {array.dtype}")
-        elif not _fits(array.shape, expected.shape, sizes):
-            problems.add(where, _misfit(array.shape, expected.shape, sizes))
-        else:
-            for letter, size in zip(expected.shape, array.shape, strict=True):
-                if isinstance(letter, str):
-                    sizes.setdefault(letter, (size, name))
-            if expected.place:
-                bad = bad_positions(array)
-                rows = (f"row {i} = ({', '.join(f'{x:g}' for x in array[i])})" for i in bad)
-                what = f"expected finite coordinates in metres, none beyond {FARTHEST:.0e}"
-                problems.add_rows(where, rows, what)
-    problems.raise_if_any()
-    return {of.field or name: raw.arrays[name] for name, of in layout.items() if name in raw.arrays}
+    check = Checker(raw, str(source))
+    for name, of in layout.items():
+        array = check.array(name, of.shape, kinds=of.kinds)
+        if array is not None:
+            letters = zip(of.shape, array.shape, strict=True)
+            check.sizes |= {letter: size for letter, size in letters if isinstance(letter, str)}
+            if of.place:
+                check_positions(check.problems, check.where(name), array, [*numbered_rows(len(array))])
+        elif name not in raw.arrays and not of.optional:
+            shape = str(of.shape).replace("'", "")
+            check.refuse(name, f"missing; expected {KIND_WORDS[of.kinds]} {shape}")
+    check.problems.raise_if_any()
+    return {name: raw.arrays[name] for name in layout if name in raw.arrays}
 
 
 def converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
@@ -288,21 +270,3 @@ def converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
     if missing:
         raise DataError(missing, path)
     return Raw({field: raw.arrays[name] for name, field in fields.items()}, {**raw.attributes, **about})
-
-
-def _fits(dims: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> bool:
-    if len(dims) != len(shape):
-        return False
-    wanted = (sizes.get(axis, (None,))[0] if isinstance(axis, str) else axis for axis in shape)
-    return all(want is None or want == size for want, size in zip(wanted, dims, strict=True))
-
-
-def _misfit(dims: tuple[int, ...], shape: tuple[str | int, ...], sizes: Mapping[str, tuple[int, str]]) -> str:
-    known = [f"{a} = {sizes[a][0]} as in {sizes[a][1]}" for a in shape if isinstance(a, str) and a in sizes]
-    here = f" with {', '.join(known)}" if known else ""
-    turned = len(dims) > 1 and dims != dims[::-1] and _fits(dims[::-1], shape, sizes)
-    return f"expected shape {_text(shape)}{here}, found {dims}{'; transposed?' if turned else ''}"
-
-
-def _text(shape: tuple[str | int, ...]) -> str:
-    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"

@@ -144,19 +144,18 @@ def read_any(
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = release_of(path)
     if release is not None:
-        reading = interpret(LOADERS[release](path), path)
-        return Reading(reading.data, (f"this is the release of dataset={release}", *reading.notes))
-    if path.is_dir():
+        raw, notes = Noted(LOADERS[release](path), (f"this is the release of dataset={release}",))
+    elif path.is_dir():
         if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
             raise DataError(
                 f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID release's "
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    raw, notes = raw_of(path, columns, stations_file)
-    campaign = campaign_of(raw)
-    if campaign is not None:
-        raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
+    else:
+        raw, notes = raw_of(path, columns, stations_file)
+        if (campaign := campaign_of(raw)) is not None:
+            raw, notes = Noted(LOADERS[campaign](path), (f"this is a file of dataset={campaign}",))
     reading = interpret(understood(raw, **settings), path)
     return Reading(reading.data, (*notes, *reading.notes))
 

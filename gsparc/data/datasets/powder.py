@@ -20,6 +20,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, converted
 from gsparc.data.errors import DataError, Problems, shortened
 from gsparc.data.files import read_text
+from gsparc.data.limits import finite, number
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw
 
@@ -60,8 +61,7 @@ def raw_of_powder(
     """
     path = Path(path)
     for name, height in (("tx_height", tx_height), ("station_height", station_height)):
-        if isinstance(height, bool) or not isinstance(height, int | float) or not np.isfinite(height):
-            raise DataError(f"dataset.{name}={height}: expected metres above ground")
+        number(-np.inf).check(f"dataset.{name}", height)
     if path.suffix.lower() == ".csv":
         raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
     else:
@@ -136,17 +136,13 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
         raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
     problems, places = Problems(path), {}
     for name, value in content.items():
-        if value is None:
-            continue
-        try:
-            latitude, longitude = (float(x) for x in value)
-        except (TypeError, ValueError):
+        degrees = finite(value)
+        if value is not None and degrees.shape != (2,):
             problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
-            continue
-        fault = bad_degrees(latitude, longitude)
-        if fault:
+        elif value is not None and (fault := bad_degrees(*degrees)):
             problems.add(f"{path}, {name}", fault[1])
-        places[str(name).strip()] = (latitude, longitude)
+        elif value is not None:
+            places[str(name).strip()] = (degrees[0], degrees[1])
     problems.raise_if_any()
     if not places:
         raise DataError(f"{path}: no station with coordinates in it")

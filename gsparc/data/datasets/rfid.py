@@ -8,11 +8,11 @@ train_index.txt, test_index.txt   optional, both or none: one number per line
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -21,15 +21,17 @@ from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.blocks import empty
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_csv, read_yaml
+from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
-from gsparc.data.own_checks import quaternion_to_matrix
+from gsparc.data.own_checks import is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements, TrainTest
 from gsparc.ops import SphereGrid
 
+if TYPE_CHECKING:
+    from gsparc.data.tables.sheet import Sheet
+
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
-NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
 SPLITS = ("train", "test")
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
@@ -101,19 +103,28 @@ def load_rfid(
 
 def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, TrainTest | None]:
     """Rows (n,) that a list names, of `count`, and the (train, test) rows among them."""
-    missing = "missing; expected a CSV with the columns spectrum,split"
-    cells = problems.attempt(lambda: read_csv(path, missing))
-    wrong = [
-        f"line {i + 2}"
-        for i, row in enumerate(cells[1:] if cells else [])
-        # Decimal digits only: `int` alone takes signs, underscores and spaces.
-        if len(row) != 2 or not row[0].isdecimal() or not 1 <= int(row[0]) <= count or row[1] not in SPLITS
-    ]
-    problems.add_rows(path, wrong, f"expected the number of a spectrum, 1 to {count}, and train or test")
-    if wrong or not cells:
+    sheet = problems.attempt(lambda: _sheet(path, ["spectrum", "split"], problems))
+    number = None if sheet is None else sheet.numbers("spectrum")
+    if sheet is None or number is None:
         return np.zeros(0, np.int64), None
-    train = np.array([row[1] == SPLITS[0] for row in cells[1:]], bool)
-    return np.array([int(row[0]) - 1 for row in cells[1:]]), (np.flatnonzero(train), np.flatnonzero(~train))
+    part = sheet.words("split")
+    wrong = np.flatnonzero(~(np.isin(number, np.arange(1, count + 1)) & np.isin(part, SPLITS)))
+    sheet.refuse_rows(
+        "spectrum", wrong, f"expected the number of a spectrum, 1 to {count}, and train or test"
+    )
+    return number.astype(np.int64) - 1, (np.flatnonzero(part == "train"), np.flatnonzero(part == "test"))
+
+
+def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
+    """A table of these columns; `DataError` where it is none, or has others."""
+    from gsparc.data.tables.opening import sheet_of  # here, as pandas takes half a second to import
+
+    sheet, _ = sheet_of(path, problems)
+    sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))
+    if sorted(sheet.heads) != sorted(heads):
+        found = ",".join(sheet.heads)
+        raise DataError(f"{path}, line 1: expected the header {','.join(heads)}, found {found}")
+    return sheet
 
 
 class _Gateway(NamedTuple):
@@ -131,55 +142,33 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
     if content is None:
         return None
     gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
-    if not gateways:
-        return problems.add(path, "no gateway in it; expected e.g. `gateway1:` with position and orientation")
-    name = next(iter(gateways)) if wanted is None else wanted
+    name = next(iter(gateways), "gateway1") if wanted is None else wanted
     if name not in gateways:
-        return problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
+        there = f"there are {', '.join(gateways)}" if gateways else f"no gateway in it; expected {entry}"
+        return problems.add(path, f"no gateway named {name!r}; {there}")
     pose = [gateways[name].get(key) for key in ("position", "orientation")]
     position, orientation = map(finite, pose)
     if position.shape != (3,):
         problems.add(path, f"{name}: position is {pose[0]}; expected three finite numbers [m]")
     else:
         check_positions(problems, str(path), position[None], [f"{name}: position"])
-    if orientation.shape != (4,):
-        expected = "expected a quaternion of four finite numbers (x, y, z, w)"
+    # The release prints (x, y, z, w), the schema expects the scalar first.
+    if orientation.shape != (4,) or not is_unit(orientation):
+        expected = "expected a quaternion of four finite numbers (x, y, z, w), of length 1"
         return problems.add(path, f"{name}: orientation is {pose[1]}; {expected}")
-    try:
-        # The release prints (x, y, z, w), the schema expects the scalar first.
-        rotation = quaternion_to_matrix(orientation, scalar_first=False)
-    except ValueError as error:
-        return problems.add(path, f"{name}: orientation: {error}")
-    dataset = str(content.get("dataset_name", "unnamed"))
-    return _Gateway(dataset, name, position, rotation)
+    rotation = quaternion_to_matrix(orientation, scalar_first=False)
+    return _Gateway(str(content.get("dataset_name", "unnamed")), name, position, rotation)
 
 
 def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     """Tag positions (S, 3) float64 [m]."""
-    missing = "missing; expected a header x,y,z and one row per spectrum"
-    rows = problems.attempt(lambda: read_csv(path, missing))
-    if rows is None:
+    sheet = problems.attempt(lambda: _sheet(path, ["x", "y", "z"], problems))
+    axes = [] if sheet is None else [sheet.numbers(axis) for axis in "xyz"]
+    known = [values for values in axes if values is not None]
+    if sheet is None or len(known) < len(axes):
         return None
-    # Editors leave blank lines at the end; one between rows would shift all images and is refused.
-    while rows and not any(cell.strip() for cell in rows[-1]):
-        rows.pop()
-    if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
-        header = ",".join(rows[0]) if rows else "an empty file"
-        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {header}")
-    if len(rows) == 1:
-        return problems.add(path, "no rows; expected one position per spectrum")
-    positions = np.full((len(rows) - 1, 3), np.nan)
-    readable: list[int] = []
-    for i, row in enumerate(rows[1:]):
-        # Python's `float` reads `1_0` and digits of other scripts, which no release writes.
-        values = [float(cell) for cell in row if NUMBER.fullmatch(cell)]
-        if not len(values) == len(row) == 3:
-            problems.add(f"{path}, line {i + 2}", f"expected three numbers x,y,z, found {','.join(row)!r}")
-            continue
-        positions[i] = values
-        readable.append(i)
-    # Rows that could not be read are reported above and have NaN, which would be reported twice.
-    check_positions(problems, str(path), positions[readable], [f"line {i + 2}" for i in readable])
+    positions = np.stack(known, axis=1)
+    check_positions(problems, str(path), positions, [*sheet.rows])
     return positions
 
 
@@ -191,8 +180,6 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     if count is None:
         return None
     expected = [f"{i:05d}.png" for i in range(1, count + 1)]
-    if not there:
-        return problems.add(folder, f"no PNG images in it; tx_pos.csv has {count} rows")
     missing = [name for name in expected if name not in there]
     extra = sorted(there - set(expected))
     problems.add_rows(folder, missing, f"missing, but tx_pos.csv has {count} rows")

@@ -20,6 +20,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
+from gsparc.data.limits import finite
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf
 from gsparc.data.schema import FLAGS, LABELS, TEXT
 
@@ -69,13 +70,7 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
 
 def _with_experiments(raw: Raw, path: Path) -> Raw:
     """The same with an axis of experiments where a file of one experiment has none."""
-    missing = [name for name, wanted in RELEASE.items() if not wanted.optional and name not in raw.arrays]
-    single = "csi_real" in raw.arrays and raw.arrays["csi_real"].ndim == 2
-    missing = [name for name in missing if not (single and name == "experiment_id")]
-    if missing:
-        there = ", ".join(sorted(raw.arrays)) or "no variables"
-        raise DataError(f"{path}: {', '.join(missing)} missing in a Techtile NetCDF file; it holds {there}")
-    if not single:
+    if "csi_real" not in raw.arrays or raw.arrays["csi_real"].ndim != 2:
         return raw
     arrays = dict(raw.arrays)
     for name, wanted in RELEASE.items():
@@ -145,11 +140,10 @@ def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
 def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     channels: Any = entry.get("channels")
     try:
-        antenna = channels[CHANNEL]  # of a list, or of a table with numbers
-        place = np.array([float(antenna[axis]) for axis in "xyz"])
-    except (TypeError, KeyError, IndexError, ValueError):
-        place = np.full(3, np.nan)
-    if not np.isfinite(place).all():
+        place = finite([channels[CHANNEL][axis] for axis in "xyz"])  # of a list, or of a table with numbers
+    except (TypeError, KeyError, IndexError):
+        place = np.zeros(0)
+    if not len(place):
         raise DataError(f"{path}, {host}: expected x, y, z [m] of channel {CHANNEL}, found {channels!r:.80}")
     return place
 

@@ -7,6 +7,7 @@ A file may hold one row per place and a column per station (wide), or one row pe
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from gsparc.data.links.stations import SECTOR, by_carrier, ends_of, numbered, st
 from gsparc.data.links.strongest import Lists, moments
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
-from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links
+from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links, Stations
 from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
@@ -29,6 +30,7 @@ LEAST_LISTED = 3  # stations, for lists of the strongest
 SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
 UNLISTED_EACH = 2  # rows of what is not listed for one that is
 STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", *SECTOR)
+OF_ROWS = ("station", "place", "run")  # arrays that go into `Links`
 
 
 def expand(check: Checker, measured: str) -> Links | None:
@@ -49,7 +51,16 @@ def expand(check: Checker, measured: str) -> Links | None:
         return None
     read = _with_table if "station_position" in check.raw.arrays else _without_table
     links = read(check, measured)
-    return None if links is None else replace(links, georeference=origin)
+    if links is None:
+        return None
+    held = check.raw.arrays
+    parts: dict[str, Any] = {name: held.pop(name) for name in OF_ROWS if name in held}
+    if links.stations is not None:
+        # From here on rows have positions of their own, as in a file of one static end.
+        held[f"{links.static_end}_position"] = links.stations.position[parts["station"]]
+        if links.stations.rotation is not None:
+            held["rx_rotation"] = links.stations.rotation[parts["station"]]
+    return replace(links, georeference=origin, **parts)
 
 
 def _without_table(check: Checker, measured: str) -> Links | None:
@@ -58,24 +69,23 @@ def _without_table(check: Checker, measured: str) -> Links | None:
     for name in check.given(*STATION_FIELDS):
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     rows = len(arrays[measured]) if arrays[measured].ndim else 0
-    run = _run(check, rows)
+    _number_runs(check, rows)
     # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
     if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")
         arrays["tx_position"] = np.full(3, np.nan)
-        links = Links("tx", run=run, unknown_transmitter=True)
-        moving = arrays["rx_position"]
+        links, moving = Links("tx", unknown_transmitter=True), arrays["rx_position"]
     else:
         ends = [check.real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
         if any(end is None for end in ends):
-            return Links("tx", run=run)  # what is missing is said where positions are read
+            return Links("tx")  # what is missing is said where positions are read
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
-        links, moving = ends_of(check, rx, tx, run), np.hstack([rx, tx])
-    if links.place is None and moving.ndim == 2 and len(moving) == rows:
+        links, moving = ends_of(check, rx, tx), np.hstack([rx, tx])
+    if links.stations is None and moving.ndim == 2 and len(moving) == rows:
         place = numbered(moving)
         if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on
-            links = replace(links, place=place)
-    return _valid(check, measured, links, np.zeros(rows, np.int64))
+            arrays["place"] = place
+    return _valid(check, measured, links)
 
 
 def _with_table(check: Checker, measured: str) -> Links | None:
@@ -89,122 +99,86 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         return check.refuse("station_position", f"{wanted}; found {names}")
     if stations is None:
         return None
-    moving: End = "rx" if ends == ["rx_position"] else "tx"
-    values = check.raw.arrays[measured]
-    long = "station" in check.raw.arrays
-    count = len(stations)
-    if count == 1 and not long and values.shape[1:2] != (1,):  # one station has no columns to tell apart
-        check.raw.arrays["station"], long = np.zeros(len(values), np.int64), True
+    arrays, count, static = check.raw.arrays, len(stations), OTHER[ends[0][:2]]
+    values = arrays[measured]
+    if count == 1 and values.shape[1:2] != (1,):  # one station has no columns to tell apart
+        arrays.setdefault("station", np.zeros(len(values), np.int64))
+    rows, long = len(values), "station" in arrays
     if not long and (values.ndim < 2 or values.shape[1] != count):
         return check.refuse(
             measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
             "or say which station each row is of with `station` (S,)",
         )  # fmt: skip
-    rows = len(values)
-    run = _run(check, rows)
-    which = station_of_row(check, rows, count) if long else None
-    carriers = check.real("carrier_hz", (), (count,), (rows,)) if "carrier_hz" in check.raw.arrays else None
-    if len(check.problems) > before:
+    _number_runs(check, rows)
+    station = station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
+    carriers = check.real("carrier_hz", (), (count,), (rows,))
+    positions = check.real(ends[0], (rows, 3))
+    if static == "tx" and stations.rotation is not None:
+        check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
+    if len(check.problems) > before or station is None or positions is None:
         return None
-    positions = check.real(f"{moving}_position", (rows, 3))
-    # Without readable positions every row counts as a place; what is wrong with them is noted.
-    place = np.arange(rows) if positions is None else numbered(positions)
-    if long:
-        assert which is not None
-        links = Links(OTHER[moving], stations, which, place, run=run)
-    else:
-        # A wide row becomes as many rows as there are stations, side by side.
+    arrays["place"] = numbered(positions)
+    if not long:  # a wide row becomes as many rows as there are stations, side by side
         check.raw = _unrolled(check.raw, measured, count)
-        links = Links(
-            OTHER[moving], stations, np.tile(np.arange(count), rows), np.repeat(place, count),
-            run=None if run is None else np.repeat(run, count),
-        )  # fmt: skip
-    of_level = links.station  # a station at two carriers has one level
-    links = by_carrier(check, links, carriers, rows, hopping=measured in POWERS)
-    check.raw.arrays[f"{OTHER[moving]}_position"] = links.stations.position[links.station]  # type: ignore[union-attr, index]
-    if links.stations is not None and links.stations.rotation is not None:
-        if OTHER[moving] == "tx":
-            return check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
-        check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
-    # From here on rows have positions of their own, as in a file of one static end.
-    for name in STATION_FIELDS:
+    check.raw.arrays["station"] = station
+    stations = by_carrier(check, stations, carriers, rows, hopping=measured in POWERS)
+    for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
-    if long and check.raw.attributes.get("absent") == "silent":
-        links, of_level = _with_absent(check, measured, links)
-    if check.raw.attributes.get("absent", "auto") == "auto" and measured == "rssi_db":
-        links, of_level = _with_unlisted(check, links, of_level)  # type: ignore[arg-type]
-    return _valid(check, measured, links, of_level, count)  # type: ignore[arg-type]
+    absent = check.raw.attributes.get("absent", "auto")
+    if long and absent == "silent":
+        _with_absent(check, measured, len(stations))
+    if absent == "auto" and measured == "rssi_db":
+        _with_unlisted(check, stations, static)
+    return _valid(check, measured, Links(static, stations))
 
 
-def _with_absent(check: Checker, measured: str, links: Links) -> tuple[Links, np.ndarray | None]:
-    """A row that was not heard for each place and station without one, and the stations of all rows."""
-    assert links.stations is not None and links.station is not None and links.place is not None
-    count, rows = len(links.stations), len(links.station)
+def _with_absent(check: Checker, measured: str, count: int) -> None:
+    """Add a row that was not heard for each place and station, of `count`, without one."""
     if measured != "rssi_db":
-        check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
-    _, first, of_place = np.unique(links.place, return_index=True, return_inverse=True)
+        return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
+    station, place = (check.raw.arrays[name] for name in ("station", "place"))
+    _, first, of_place = np.unique(place, return_index=True, return_inverse=True)
     # Links are numbered place by station, so that those without a row are a set difference.
-    lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + links.station)
-    station = np.concatenate([links.station, lost % count])
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + station)
     # Minus infinity lies below whatever turns out to be the limit of hearing.
-    level = np.full(len(lost), -np.inf)
-    links = _repeated(check, links, np.r_[:rows, first[lost // count]], station, level)
+    _repeat(check, np.r_[: len(station), first[lost // count]], lost % count)
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
-    return links, station
 
 
-def _repeated(check: Checker, links: Links, like: np.ndarray, of: np.ndarray, level: np.ndarray) -> Links:
-    """Rows `like` (n,), of stations `of` (n,); the last of them have levels (m,) [dB] of their own."""
-    assert links.stations is not None and links.station is not None and links.place is not None
-    arrays = take_rows(check.raw.arrays, like, len(links.station))
-    levels = arrays["rssi_db"].astype(np.float64)
-    levels[len(like) - len(level) :] = level
-    stand = {f"{links.static_end}_position": links.stations.position[of]}
-    check.raw = replace(check.raw, arrays={**arrays, "rssi_db": levels, **stand})
-    run = None if links.run is None else links.run[like]
-    return replace(links, station=of, place=links.place[like], run=run)
+def _repeat(check: Checker, like: np.ndarray, station: np.ndarray) -> None:
+    """Take rows `like` (n,); the last of them are of stations (m,) that were not heard there."""
+    arrays = take_rows(check.raw.arrays, like, len(check.raw.arrays["station"]))
+    heard = len(like) - len(station)
+    arrays["station"] = np.r_[arrays["station"][:heard], station]
+    arrays["rssi_db"] = np.r_[arrays["rssi_db"][:heard].astype(np.float64), np.full(len(station), -np.inf)]
+    check.raw = replace(check.raw, arrays=arrays)
 
 
-def _with_unlisted(check: Checker, links: Links, of_level: np.ndarray) -> tuple[Links, np.ndarray]:
-    """Lists of the strongest with rows, twice as many as are listed, of stations that they leave out.
-
-    Returns:
-        The links, and the stations of all rows; as they were where there are no such lists.
-    """
-    arrays, levels = check.raw.arrays, check.raw.arrays["rssi_db"]
-    count, rows = len(links.stations or ()), len(levels)
+def _with_unlisted(check: Checker, stations: Stations, static: End) -> None:
+    """Add to lists of the strongest rows, twice as many as are listed, of stations that they leave out."""
+    arrays, count = check.raw.arrays, len(stations)
+    levels, of = arrays["rssi_db"], arrays["station"]
     whole = levels.ndim == 1 and levels.dtype.kind in "iuf" and "mask" not in arrays
-    if not whole or count < LEAST_LISTED or "rx_rotation" in arrays:
-        return links, of_level
-    assert links.stations is not None and links.station is not None and links.place is not None
-    level = check.real("sensitivity_db", (), (max(of_level.max(initial=0) + 1, 1),), (rows,))
-    heard = np.flatnonzero(np.isfinite(levels))
-    if ("sensitivity_db" in arrays and (level is None or level.shape == (rows,))) or not len(heard):
-        return links, of_level
-    moving = check.real(f"{OTHER[links.static_end]}_position", (rows, 3))  # type: ignore[index]
-    if moving is None:
-        return links, of_level
-    moment = moments(links.place[heard], links.station[heard])
-    lists = Lists.of(moment, links.station[heard], levels[heard], moving[heard], count)
+    heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
+    level = check.real("sensitivity_db", (), (count,), (len(of),))
+    known = level is None or level.shape in ((), (count,))  # of stations, if at all: lists have no other
+    if count < LEAST_LISTED or not len(heard) or not known or ("sensitivity_db" in arrays and level is None):
+        return
+    moment = moments(arrays["place"][heard], of[heard])
+    moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
+    lists = Lists.of(moment, of[heard], levels[heard], moving, count)
     if not lists.recognised():
-        return links, of_level
+        return
     # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
-    floor = np.full(count, levels[heard].min() if level is None else np.min(level))
-    if level is not None:
-        floor[links.station] = level.reshape(-1)[of_level * (level.size > 1)]
-    most = UNLISTED_EACH * len(heard)
-    of_list, station, below = lists.unlisted(floor, links.stations.position, most)
-    like = np.r_[heard, heard[lists.first[of_list]]]
-    station = np.r_[links.station[heard], station]
-    arrays.pop("sensitivity_db", None)
-    links = _repeated(check, links, like, station, np.full(len(below), -np.inf))
+    floor = np.broadcast_to(levels[heard].min() if level is None else level, count)
+    of_list, station, below = lists.unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
+    _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     check.notes.append(
         f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
         f" below its weakest, in others below {floor.min():.4g} dB; {len(below)} such rows beside"
         f" {len(heard)} listed, those that tell most (dataset.absent=unknown takes none)"
     )
-    return links, station
 
 
 def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
@@ -295,52 +269,54 @@ def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndar
     return above
 
 
-def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
+def _valid(check: Checker, measured: str, links: Links) -> Links | None:
     """Rows without a missing value; censored ones hold the level that they lie below or above, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
+    count = 1 if links.stations is None else len(links.stations)
     level = check.real("sensitivity_db", (), (count,), values.shape[:1])
     if "sensitivity_db" in arrays and level is None:
         return None
-    if level is not None and measured != "rssi_db":
-        return check.refuse("sensitivity_db", f"goes with rssi_db, not with {measured}")
-    if measured != "rssi_db" and not isinstance(check.raw.attributes.get("saturation_db", "auto"), str):
-        return check.refuse("dataset.saturation_db", f"goes with rssi_db, not with {measured}")
-    # Limits of rows and of stations look alike where the counts agree: then they are of stations.
-    by_row = level is not None and level.shape == values.shape != (count,)
-    if level is not None and by_row:  # what was heard needs none
-        level = np.where(np.isnan(level) & np.isfinite(values), values, level)
-    if level is not None and not (np.isfinite(level) & (np.abs(level) <= 400)).all():
-        return check.refuse("sensitivity_db", "expected dB between -400 and 400")
+    saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
+    for name, said in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
+        if said and measured != "rssi_db":
+            return check.refuse(name, f"goes with rssi_db, not with {measured}")
+    floor = None
+    if level is not None and values.ndim == 1:
+        # Limits of rows and of stations look alike where the counts agree: then they are of stations.
+        of_stations = level.shape == (count,) and count > 1
+        floor = np.broadcast_to(level[arrays["station"]] if of_stations else level, values.shape)
+        floor = np.where(np.isnan(floor) & np.isfinite(values), values, floor)  # what was heard needs none
+        if not (np.abs(floor) <= 400).all():
+            return check.refuse("sensitivity_db", "expected dB between -400 and 400")
     arrays.pop("sensitivity_db", None)
     mask = arrays.get("mask")
     if mask is not None and (mask.shape != values.shape or mask.dtype.kind not in "biu"):
         return links  # said where the mask is read
     # A spectrum without power has no directions; where rows have paths they are a simulation's.
     silent = measured == "spectrum" and not is_big(values) and "path_offsets" not in arrays
-    may_miss = measured in POWERS or links.stations is not None or mask is not None or silent
-    if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
+    gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
+    if values.dtype.kind not in "iufc" or values.ndim == 0 or not (gaps or mask is not None or silent):
         return links
     axes = tuple(range(1, values.ndim))
-    gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
     marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = saturated = np.zeros(len(values), bool)
-    if measured == "rssi_db" and values.ndim == 1 and values.dtype.kind in "iuf":
-        unheard = _without_marks(check, values, level) & marked
+    if measured == "rssi_db" and values.ndim == 1:
+        unheard = _without_marks(check, values, floor) & marked
+        heard = values[~unheard & np.isfinite(values)]
         unknown |= unheard
-        if level is None and unheard.any() and np.isfinite(values[~unheard]).any():
-            level, censored = values[~unheard & np.isfinite(values)].min(), unheard
+        if floor is not None:
+            censored = unknown & marked
+        elif unheard.any() and len(heard):
+            floor, censored = np.full(len(values), heard.min()), unheard
         saturated = _saturated(check, values, ~unknown & marked)
         values = arrays[measured]
-    if level is not None:
-        censored = censored if censored.any() else unknown & marked
-        of_row = level if by_row else np.atleast_1d(level)[of_level if level.size > 1 else 0]
-        floor = np.broadcast_to(of_row, (len(values),))
+    if floor is not None:
         below = ~unknown & marked & (values < floor)
         # A value under the limit contradicts it: one of the two has another unit or receiver.
         if below.any():
             row = int(np.flatnonzero(below)[0])
-            named = links.named([str(name) for name in arrays["row_name"]])[row]
+            named = replace(links, station=arrays.get("station")).named([*map(str, arrays["row_name"])])[row]
             wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
         highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & marked].min(initial=np.inf)
@@ -362,27 +338,25 @@ def _valid(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
         why = "nothing was heard in any row" if censored.any() else "nothing was measured"
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
-        _note_lost(check, measured, links, keep, censored)
-        arrays = take_rows(arrays, np.flatnonzero(keep), len(keep))
+        _note_lost(check, measured, links.stations, keep, censored)
+        arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
         check.raw = replace(check.raw, arrays=arrays)
-        parts = {name: getattr(links, name) for name in ("station", "place", "run")}
-        pick = {name: value[keep] for name, value in parts.items() if value is not None}
-        links = replace(links, **pick)
-        side = side[keep]
-    if side.any():
-        arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
-        return replace(links, censored=side)
-    return links
+    if not side.any():
+        return links
+    arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
+    return replace(links, censored=side)
 
 
-def _note_lost(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
+def _note_lost(
+    check: Checker, measured: str, stations: Stations | None, keep: np.ndarray, censored: np.ndarray
+) -> None:
     """How many links have no value, and how many were not heard, by station."""
     if not keep.all():
         silent = " or without any power" if measured == "spectrum" else ""
         text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
-        if links.stations is not None and links.station is not None:
-            lost = np.bincount(links.station[~keep], minlength=len(links.stations))
-            most = [f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
+        if stations is not None:
+            lost = np.bincount(check.raw.arrays["station"][~keep], minlength=len(stations))
+            most = [f"{stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
             text += f" (most: {', '.join(most)})"
         weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
         check.notes.append(text + weak)
@@ -414,13 +388,11 @@ def _heights(check: Checker) -> bool:
     return len(check.problems) == before
 
 
-def _run(check: Checker, rows: int) -> np.ndarray | None:
-    """(S,) int64, the number of each row's run; runs may have names."""
+def _number_runs(check: Checker, rows: int) -> None:
+    """Number the run of each row, (S,) int64; runs may have names."""
     runs = check.array("run", (rows,))
-    if runs is None:
-        return None
-    check.raw.arrays.pop("run")
-    return np.unique(runs, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    if runs is not None:
+        check.raw.arrays["run"] = np.unique(runs, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def in_metres(check: Checker) -> Georeference | None:
@@ -470,24 +442,18 @@ def _stated(check: Checker) -> Georeference | None:
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
-    names = f"{prefix}latitude", f"{prefix}longitude"
-    latitude, longitude = (check.real(name, (None,)) for name in names)
+    latitude = check.real(f"{prefix}latitude", (None,))
+    longitude = None if latitude is None else check.real(f"{prefix}longitude", latitude.shape)
     if latitude is None or longitude is None:
-        return np.zeros(0), np.zeros(0)
-    if len(latitude) != len(longitude):
-        check.refuse(names[1], f"{len(longitude)} values for {len(latitude)} latitudes")
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
     if fault:
-        check.refuse(names[0], "row {}: {}".format(*fault))
+        check.refuse(f"{prefix}latitude", "row {}: {}".format(*fault))
     return latitude, longitude
 
 
 def _moving(check: Checker) -> str:
     """The end that degrees are of: the one with a height, or the one without a position; the receiver."""
-    for end, other in (("tx", "rx"), ("rx", "tx")):
-        if check.given(f"{end}_height") or check.given(f"{other}_position"):
-            return end
-    return "rx"
+    return "tx" if check.given("tx_height", "rx_position") else "rx"

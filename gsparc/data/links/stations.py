@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker, is_unit, quaternion_to_matrix
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
 from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
 
 # Of a station's beam, in the order of `Stations.sector`.
@@ -43,21 +42,20 @@ def numbered(places: np.ndarray) -> np.ndarray:
     return rank[which.reshape(-1)]
 
 
-def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | None) -> Links:
-    """Find which end stands still, at one place or at few; None for both moving."""
-    still: dict[End, bool] = {"rx": bool((rx == rx[:1]).all()), "tx": bool((tx == tx[:1]).all())}
-    if still["rx"] or still["tx"]:
-        return Links("rx" if still["rx"] else "tx", run=run)
-    ends = {"rx": rx, "tx": tx}
+def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
+    """Find which end stands still, at one place or at few, whose rows are then numbered; None: both move."""
+    ends: dict[End, np.ndarray] = {"tx": tx, "rx": rx}
     places = {end: np.unique(where, axis=0, return_inverse=True) for end, where in ends.items()}
-    few: End = min(("tx", "rx"), key=lambda end: len(places[end][0]))  # type: ignore[assignment]
+    few: End = min(ends, key=lambda end: len(places[end][0]))
     table, which = places[few]
+    if len(table) == 1:
+        return Links("rx" if len(places["rx"][0]) == 1 else "tx")
     if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
-        return Links(None, run=run)
+        return Links(None)
     check.notes.append(f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations")
-    stations = Stations(table, tuple(str(i) for i in range(len(table))))
-    moving = rx if few == "tx" else tx
-    return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)
+    check.raw.arrays["station"] = which.reshape(-1).astype(np.int64)
+    check.raw.arrays["place"] = numbered(ends[OTHER[few]])
+    return Links(few, Stations(table, tuple(str(i) for i in range(len(table)))))
 
 
 def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
@@ -83,11 +81,9 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
     turned = check.real("station_orientation", (count, 4))
-    if turned is not None and not is_unit(turned).all():
-        row = int(np.flatnonzero(~is_unit(turned))[0])
-        fault = f"row {row}: expected a quaternion (w, x, y, z) of length 1"
-        return check.refuse("station_orientation", fault)
-    rotation = None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
+    rotation = None if turned is None else check.turned("station_orientation", turned, called)
+    if turned is not None and rotation is None:
+        return None
     parts = [check.real(name, (count,)) for name in SECTOR]
     sector = None
     if any(part is not None for part in parts):
@@ -132,33 +128,36 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 
 
-def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int, hopping: bool) -> Links:
+def by_carrier(
+    check: Checker, stations: Stations, carriers: np.ndarray | None, rows: int, hopping: bool
+) -> Stations:
     """Part stations at several carriers, one for each; where `hopping`, carriers of a band are one."""
-    assert links.stations is not None and links.station is not None
+    arrays = check.raw.arrays
     if carriers is None or carriers.ndim == 0:
-        return links
-    if not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
-        worst = carriers[np.argmax(~((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)))]
-        check.refuse("carrier_hz", f"{worst:g}; expected Hz (not MHz or GHz)")
+        return stations
+    wrong = ~((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ))
+    if wrong.any():
+        check.refuse("carrier_hz", f"{carriers[np.argmax(wrong)]:g}; expected Hz (not MHz or GHz)")
         check.problems.raise_if_any()
-    stations, station = links.stations, links.station
-    if len(carriers) == len(stations) and len(stations) != rows:
+    station, count = arrays["station"], len(stations)
+    of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, count)
+    if len(carriers) == count != rows:
         of_link = carriers[station]
-    else:
-        if len(carriers) == len(stations) and len(np.unique(carriers)) > 1:
-            said = "as many values as rows and as stations; taken as one for each row"
-            check.notes.append(f"carrier_hz: {said}")
-        of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
+    elif len(carriers) == count and len(np.unique(carriers)) > 1:
+        said = "as many values as rows and as stations; taken as one for each row"
+        check.notes.append(f"carrier_hz: {said}")
     of_link = _of_one(check, station, of_link, stations.name) if hopping else of_link
     pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
     first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]
-    check.raw.arrays.pop("carrier_hz")
+    arrays.pop("carrier_hz")
     if len(np.unique(carrier)) == 1:
-        check.raw.arrays["carrier_hz"] = np.array(carrier[0])
-        return links
+        arrays["carrier_hz"] = np.array(carrier[0])
+        return stations
     several = np.bincount(first)[first] > 1  # a station of one carrier keeps its name
     called = zip(first, carrier, several, strict=True)
     names = tuple(stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called)
-    parts = [None if one is None else one[first] for one in (stations.rotation, stations.sector)]
-    table = Stations(stations.position[first], names, parts[0], carrier, parts[1])
-    return replace(links, stations=table, station=which.reshape(-1).astype(np.int64))
+    rotation, sector = (None if one is None else one[first] for one in (stations.rotation, stations.sector))
+    arrays["station"] = which.reshape(-1).astype(np.int64)
+    if arrays.get("sensitivity_db", np.zeros(())).shape == (count,):  # of both carriers alike
+        arrays["sensitivity_db"] = arrays["sensitivity_db"][first]
+    return Stations(stations.position[first], names, rotation, carrier, sector)

@@ -62,8 +62,8 @@ def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
         if head in values:  # a mean of equal numbers is that number, but for rounding
             least, most = frame[f"min {number}"], frame[f"max {number}"]
             frame[f"key {number}"] = frame[f"mean {number}"].clip(least, most)
-    columns, rows = tuple(frame[key] for key in keys), tuple(f"cell {i}" for i in range(len(frame)))
-    return replace(first, heads=tuple(wanted), columns=columns, rows=rows)
+    rows = tuple(f"cell {i}" for i in range(len(frame)))
+    return replace(first, frame=frame[keys].set_axis([*wanted], axis=1), rows=rows)
 
 
 def _metres(column: Column, chosen: Chosen, first: Sheet) -> float:

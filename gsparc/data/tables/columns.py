@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import math
 import re
@@ -12,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, some
+from gsparc.data.errors import Caution, nearest, some
 from gsparc.data.tables import heads
 from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, suits, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
@@ -85,7 +84,7 @@ def choose(
     used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.understand(head) if head and head not in used_heads else Head()
+        meaning = heads.understand(head) if head not in used_heads else Head()
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
@@ -135,7 +134,7 @@ def choose(
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
         notes += _wide_survey(sheet, chosen)
     used = {column.head for columns in chosen.values() for column in columns}
-    unused = [repr(head) for head in sheet.heads if head and head not in used]
+    unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
@@ -210,8 +209,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
-        close = difflib.get_close_matches(key, [*KINDS, *heads.OTHER_NAMES], 1, 0.4)
-        hint = f"; did you mean {close[0]}?" if close else f"; known are {', '.join(KINDS)}"
+        hint = nearest(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
     head = _head(sheet, text)
@@ -231,11 +229,9 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
         named = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
         # A pattern has one star: what it stands for in a head is the name of the station or tone.
         before, _, after = text.partition("*")
-        labels = [h[len(before) : len(h) - len(after)] for h in named]
+        labels = {h: unit_of(h[len(before) : len(h) - len(after)])[0].strip() for h in named}
         if named and "*" not in after:
-            labels = [unit_of(label)[0].strip() for label in labels]
-            pairs = zip(named, labels, strict=True)
-            return tuple(Column(role, label, _unit(h, role), head=h) for h, label in pairs)
+            return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
         fault = "expected one * only" if "*" in after else "no column is called so"
         return sheet.problems.add(where, fault) or ()
     # `FIRST:LAST` of frequencies, or one number for all rows; other text becomes NaN and no constant.
@@ -243,9 +239,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
         return (Column(role, value=numbers),)
-    close = difflib.get_close_matches(text.lower(), [h.lower() for h in sheet.heads], 1, 0.4)
-    near = next((h for h in sheet.heads if close and h.lower() == close[0]), None)
-    hint = f"; did you mean {near!r}?" if near else f"; there are {sheet.first_heads()}"
+    hint = nearest(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
 
 

@@ -51,15 +51,12 @@ def read_parquet(source: str, most: int | None = None) -> Sheet:
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
     if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
         frame = frame.reset_index(allow_duplicates=True)
-    heads = tuple(str(name) for name in frame.columns)
-    twice = [name for name in heads if heads.count(name) > 1]
-    if twice:
-        raise DataError(f"{source}: two columns are named {twice[0]!r}; rename one")
+    frame.columns = frame.columns.astype(str)
+    for name in frame.columns[frame.columns.duplicated()]:
+        raise DataError(f"{source}: two columns are named {name!r}; rename one")
     if not len(frame):
         raise DataError(f"{source}: no rows")
-    rows = tuple(f"row {i}" for i in range(len(frame)))
-    columns = tuple(frame.iloc[:, i] for i in range(len(heads)))
-    return Sheet(source, heads, columns, rows, problems=Problems(source))
+    return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
 
 
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
@@ -91,13 +88,11 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
     lines, banner_notes = _without_banner(lines)
     notes += banner_notes
-    excel = re.fullmatch(r"sep=(.)", lines[min(lines)].strip())
-    if excel:  # Excel's own hint
+    if re.fullmatch("sep=.", lines[min(lines)].strip()) and len(lines) > 1:  # Excel's own hint
         del lines[min(lines)]
-        comment = ""
-    delimiter = excel[1] if excel else _delimiter(list(lines.values()), comment)
-    if delimiter is None or not lines:
-        fault = f"line 1 ({lines[min(lines)][:40]!r}) is a single column" if lines else "no heads"
+    delimiter = _delimiter([*lines.values()], comment)
+    if delimiter is None:
+        fault = f"line {min(lines)} ({lines[min(lines)][:40]!r}) is a single column"
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     width = len(_cells(lines[min(lines)], delimiter))
     if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
@@ -122,8 +117,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
     notes += decimal_notes
-    columns = tuple(frame[i] for i in range(len(heads)))
-    return Sheet(source, tuple(heads), columns, tuple(f"line {n}" for n in lines)[1:], decimal), notes
+    named = frame.set_axis(heads, axis=1)[[head for head in heads if head]]
+    return Sheet(source, named, tuple(f"line {n}" for n in lines)[1:], decimal), notes
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -189,8 +184,7 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
         named = {cell: bool(understand(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
-        filled = [sum(bool(cell.strip()) for cell in row) for row in cells[:first]]
-        above = [len(row) != usual or 2 * n <= usual for row, n in zip(cells, filled, strict=False)]
+        above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
         if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
             kept = {n: line for n, line in lines.items() if n >= numbers[first]}
             note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
@@ -220,18 +214,17 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 def _delimiter(lines: list[str], comment: str) -> str | None:
     """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
-    best: tuple[bool, float, int, str] | None = None
     sample = lines[:LOOKED_AT]
-    for delimiter in DELIMITERS:
+
+    def suits(delimiter: str) -> tuple[bool, bool, bool, float, int]:
         count = len(_cells(sample[0], delimiter))
         named = _cells(comment, delimiter) if comment else []
         heads = len(named) == count and any(understand(cell).role for cell in named)
-        if count < 2 or (delimiter == " " and best is not None and best[0] >= heads):
-            continue
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
-        if best is None or (heads, agree, count) > best[:3]:
-            best = (heads, agree, count, delimiter)
-    return None if best is None else best[3]
+        return count > 1, heads, delimiter != " ", agree, count  # spaces may stand in cells
+
+    best = max(DELIMITERS, key=suits)
+    return best if suits(best)[0] else None
 
 
 def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Lines:
@@ -355,10 +348,7 @@ def _stacked(parts: list[tuple[Sheet, list[str]]], source: str) -> tuple[Sheet, 
         if set(sheet.heads) != set(first.heads) or sheet.decimal != first.decimal:
             lacking = sorted(set(sheet.heads) ^ set(first.heads))[:3]
             raise DataError(f"{sheet.source}: other columns than {first.source} has: {', '.join(lacking)}")
-    columns = (
-        pd.concat([sheet.columns[sheet.heads.index(head)] for sheet, _ in parts], ignore_index=True)
-        for head in first.heads
-    )
+    frame = pd.concat([sheet.frame[[*first.heads]] for sheet, _ in parts], ignore_index=True)
     rows = tuple(f"{Path(sheet.source).name}, {row}" for sheet, _ in parts for row in sheet.rows)
     notes = list(dict.fromkeys(note for _, own in parts for note in own))
-    return replace(first, source=source, columns=tuple(columns), rows=rows), notes
+    return replace(first, source=source, frame=frame, rows=rows), notes

@@ -190,14 +190,14 @@ class StationList:
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
-    naming = [head for head in sheet.heads if head and understand(head).role == "station"]
+    naming = [head for head in sheet.heads if understand(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam is no measurement, whatever its head says besides.
-    heads = tuple("" if meaning(head) in (*SECTOR, *TILTS) else head for head in sheet.heads)
-    chosen, notes = choose(replace(sheet, heads=heads), {"station": called[0]} if len(called) == 1 else {})
+    others = sheet.frame[[head for head in sheet.heads if meaning(head) not in (*SECTOR, *TILTS)]]
+    chosen, notes = choose(replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {})
     chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
-    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if head and meaning(head))]
+    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if meaning(head))]
     notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station"), notes
@@ -226,11 +226,8 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     for name in values[(counts > 1) & (values != "")]:
         rows = " and ".join(sheet.rows[i] for i in np.flatnonzero(names == name)[:2])
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
-    extra = {}
-    for role in PER_STATION:
-        array = chosen[role][0].numbers(sheet) if role in chosen else sectors.get(role)
-        if array is not None:
-            extra[role] = array
+    facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
+    extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
     return StationList(tuple(map(str, names)), coordinates, extra, aliases=tuple(other)), notes
 
 
@@ -239,7 +236,7 @@ def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
     result: list[tuple[str, ...]] = []
     for head in sheet.heads:
         words = set(words_of(head)) & STATION_WORDS
-        if not head or not words:
+        if not words:
             continue
         result += [(head,)] if head not in used else []
         beside = TOGETHER.get(min(words), set())

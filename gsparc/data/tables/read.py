@@ -17,7 +17,7 @@ from gsparc.data.files import Several
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
-from gsparc.data.schema import ENDS
+from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.tables.cells import LOOKED_AT, merged
 from gsparc.data.tables.columns import CHANNELS, JOINED, LEVELS, POLAR, Chosen, Column, choose, schema_unit
 from gsparc.data.tables.heads import LISTS, PERCENT, words_of
@@ -146,19 +146,14 @@ class Builder:
         pairs = [self._tones(part) for part in names]
         # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
-        parts: list[list[np.ndarray]] = [[], []]
-        for tone in self.tones.tolist():
-            for i, columns, other in zip((0, 1), pairs, pairs[::-1], strict=True):
-                if tone not in columns:
-                    fault = f"{other[tone].head!r} has no {names[i]} beside it"
-                    self.refuse(f"{fault}; say dataset.columns.{names[i]}=COLUMN")
-                    continue
-                values = columns[tone].numbers(self.sheet)
-                if values is not None:
-                    parts[i].append(values)
+        for name, own, other in zip(names, pairs, pairs[::-1], strict=True):
+            for tone in sorted(set(other) - set(own)):
+                fault = f"{other[tone].head!r} has no {name} beside it"
+                self.refuse(f"{fault}; say dataset.columns.{name}=COLUMN")
+        parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs]
         if self.sheet.problems:
             return
-        first, second = (np.stack(part, axis=1) for part in parts)
+        first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         if names == POLAR:
             # A unit in the head has turned values into degrees by now; without one, over a turn is no radian.
             degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
@@ -206,19 +201,29 @@ class Builder:
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
         self.zones = self._zones(where)
+        others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
-            self._add_stations(stations, where.degrees)
+            self.arrays["station_name"] = np.array(stations.names)
+            self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
+            others["station"] = stations.places
         # Warnings need the level and the station of each row, so both are known before.
         self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
-        for other in ends.values():  # the end that is left, where there are no stations
-            self._add_other("tx" if moving == "rx" else "rx", other, where)
+        for name, other in others.items():
+            if other.degrees != where.degrees:
+                units = ("degrees", "metres") if where.degrees else ("metres", "degrees")
+                fault = (
+                    f"{units[0]}, those of {ENDS.get(name, 'stations')} in {units[1]}; expected one of them"
+                )
+                return self.refuse(f"the places of rows are in {fault}")
+            still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
+            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
     def _unused(self) -> dict[str, np.ndarray]:
         """Text (S,) of the columns that are not used, those of one value left out."""
         used = {column.head for columns in self.chosen.values() for column in columns}
         # A column of one value tells nothing apart, whatever it is called.
-        words = {head: self.sheet.words(head) for head in self.sheet.heads if head and head not in used}
+        words = {head: self.sheet.words(head) for head in self.sheet.heads if head not in used}
         return {head: text for head, text in words.items() if (text != text[0]).any()}
 
     def _zones(self, where: Places) -> str:
@@ -346,8 +351,7 @@ class Builder:
         used = {column.head for columns in self.chosen.values() for column in columns}
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
-            close = difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6)
-            for head in close:
+            for head in difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6):
                 self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
@@ -366,14 +370,12 @@ class Builder:
         if head is not None:
             self.listed, lacking, said = self.listed.with_lacking(words)
             self.notes += said
-        for word in dict.fromkeys(words[words != ""].tolist()):
-            if word in self.listed.names or word in lacking:
-                continue
-            hint = nearest(word, self.listed.names)
-            place = "the heads"
-            if head is not None:
-                place = f"column {head!r}, {self.sheet.rows[int(np.argmax(words == word))]}"
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
+        known = {"", *self.listed.names, *lacking}
+        for word in [word for word in dict.fromkeys(words.tolist()) if word not in known]:
+            row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
+            place = "the heads" if head is None else f"column {head!r}, {row}"
+            fault = f"{word!r} is no listed station{nearest(word, self.listed.names)}"
+            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None
@@ -405,24 +407,6 @@ class Builder:
         each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
         names = tuple(f"station {i}" for i in range(len(values)))
         return StationList(names, each, index=index.reshape(-1))
-
-    def _add_stations(self, stations: StationList, degrees: bool) -> None:
-        if stations.places.degrees != degrees:
-            words = ("degrees", "metres") if degrees else ("metres", "degrees")
-            fault = f"the places of rows are in {words[0]}, those of stations in {words[1]}"
-            return self.refuse(f"{fault}; expected one of them")
-        self.arrays["station_name"] = np.array(stations.names)
-        if stations.index is not None:
-            self.arrays["station"] = stations.index.astype(np.int64)
-        self._add_places("station", stations.places)
-        return None
-
-    def _add_other(self, name: str, other: Places, moving: Places) -> None:
-        if other.degrees != moving.degrees:
-            self.refuse("one end is in degrees, the other in metres; expected one of them for both")
-        else:
-            still = len(np.unique(other.all(), axis=0)) == 1
-            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
     def _add_places(self, name: str, where: Places, still: bool = False) -> None:
         """Add positions [m], or degrees and heights."""

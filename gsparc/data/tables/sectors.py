@@ -46,14 +46,12 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     """
     found: dict[str, np.ndarray] = {}
     notes, unread, heads = [], [], []
-    for head in sheet.heads:
-        name = meaning(head) if head and head not in used else None
-        unit = unit_of(head)[1] if head else None
+    for head in [head for head in sheet.heads if head not in used]:
+        name, unit = meaning(head), unit_of(head)[1]
         words = sheet.words(head) if name else np.zeros(0, str)
         values = pd.to_numeric(pd.Series([_number(word) for word in words]), errors="coerce").to_numpy(float)
         if name is None or name in found or not np.isfinite(values).any():
-            if head and head not in used:
-                unread.append(repr(head))
+            unread.append(repr(head))
             continue
         if name == "carrier_hz" and unit is None and np.nanmax(values) < MHZ:
             values = values * MHZ
@@ -84,7 +82,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
 def sites_of(sheet: Sheet) -> np.ndarray | None:
     """Number (T,) float64 the sites that a column of the list names; None where none does."""
     for head in sheet.heads:
-        words = sheet.words(head) if head and " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
+        words = sheet.words(head) if " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
         number, names = pd.factorize(words)
         if 1 < len(names) < len(words) and (words != "").all():
             return number.astype(np.float64)

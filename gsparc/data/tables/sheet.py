@@ -30,8 +30,7 @@ class Sheet:
 
     Attributes:
         source: the file, for messages.
-        heads: one for each column, all different where they are not empty.
-        columns: as many Series, of text or of numbers.
+        frame: columns of text or of numbers by their heads, all different.
         rows: what a message calls each row: `line 2`, `row 0`.
         decimal: `.` or `,`, of numbers that are text.
         problems: takes what is wrong.
@@ -39,8 +38,7 @@ class Sheet:
     """
 
     source: str
-    heads: tuple[str, ...]
-    columns: tuple[pd.Series, ...]
+    frame: pd.DataFrame
     rows: tuple[str, ...]
     decimal: str = "."
     problems: Problems = field(default_factory=lambda: Problems(""))
@@ -49,9 +47,14 @@ class Sheet:
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Heads of the columns."""
+        return tuple(self.frame.columns)
+
     def first_heads(self) -> str:
         """Return the first heads, for messages."""
-        return ", ".join(repr(head) for head in self.heads[:8] if head)
+        return ", ".join(map(repr, self.heads[:8]))
 
     def where(self, head: str) -> str:
         """Say how messages name a column."""
@@ -67,7 +70,7 @@ class Sheet:
 
     def words(self, head: str) -> np.ndarray:
         """Return text (S,) of a column, without surrounding spaces; empty where there is no value."""
-        column = self.columns[self.heads.index(head)]
+        column = self.frame[head]
         missing = column.isna().to_numpy()
         if pd.api.types.is_float_dtype(column.dtype) and (column[~missing] % 1 == 0).all():
             column = column.astype("Int64")  # 212, not 212.0: a name that was read as a number
@@ -96,7 +99,7 @@ class Sheet:
             suits: whether cells may hold a unit.
             levels: whether text that repeats may stand for "not heard": minus infinity.
         """
-        column = self.columns[self.heads.index(head)]
+        column = self.frame[head]
         if pd.api.types.is_bool_dtype(column.dtype):
             return self.refuse("holds True and False; expected numbers", head)
         read: dict[str, float | None] = {}

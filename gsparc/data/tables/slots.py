@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Container
 from dataclasses import replace
 
-import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import some
@@ -20,7 +19,7 @@ def slots_of(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     """Return heads of each slot by what they hold, by the slot's name; empty where there are not several."""
     found: dict[str, dict[str, str]] = {}
     for head in heads:
-        words = words_of(unit_of(head)[0]) if head else []
+        words = words_of(unit_of(head)[0])
         held = [HOLDS[word] for word in words if word in HOLDS]
         name = " ".join(word for word in words if word not in HOLDS)
         if len(held) == 1 and held[0] not in found.setdefault(name, {}):
@@ -40,28 +39,16 @@ def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     used = [head for parts in slots.values() for head in parts.values()]
     if not slots or any(head in said for head in used):
         return sheet, []
-    columns = dict(zip(sheet.heads, sheet.columns, strict=True))
     # A channel that only one slot has is the moment's.
-    channels = [parts["EARFCN"] for parts in slots.values() if "EARFCN" in parts]
-    shared = channels[0] if channels else ""
+    shared = next((parts["EARFCN"] for parts in slots.values() if "EARFCN" in parts), None)
     level = next(iter(slots.values()))["RSRP"]
-    unit = level[len(unit_of(level)[0]) :]
-    names = {"PCI": "PCI", "RSRP": f"RSRP{unit}", **({"EARFCN": "EARFCN"} if channels else {})}
-    parts, rows = [], []
+    names = {"PCI": "PCI", "RSRP": f"RSRP{level[len(unit_of(level)[0]) :]}", "EARFCN": "EARFCN"}
+    kept, parts = [head for head in sheet.heads if head not in used], []
     for slot in slots.values():
-        held = np.flatnonzero((sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != ""))
-        heads = {part: slot.get(part, shared) if part == "EARFCN" else slot[part] for part in names}
-        series_of = {names[part]: columns[head].iloc[held].to_numpy() for part, head in heads.items()}
-        parts.append(pd.DataFrame(series_of))
-        rows.append(held)
-    row = np.concatenate(rows)
-    order = np.argsort(row, kind="stable")
-    whole = pd.concat(parts, ignore_index=True).iloc[order]
-    kept = [head for head in sheet.heads if head and head not in used]
-    series = [columns[head].iloc[row[order]].reset_index(drop=True) for head in kept]
-    series += [whole[name].reset_index(drop=True) for name in whole]
-    result = replace(
-        sheet, heads=(*kept, *whole.columns), columns=tuple(series),
-        rows=tuple(sheet.rows[i] for i in row[order]),
-    )  # fmt: skip
-    return result, [f"slots {some([*map(repr, slots)], 3)}: {len(row)} rows of {len(sheet)} moments"]
+        held = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
+        of_slot = {head: name for part, name in names.items() if (head := slot.get(part, shared)) is not None}
+        parts.append(sheet.frame.loc[held, [*kept, *of_slot]].rename(columns=of_slot))
+    whole = pd.concat(parts).sort_index(kind="stable")
+    rows = tuple(sheet.rows[i] for i in whole.index)
+    result = replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
+    return result, [f"slots {some([*map(repr, slots)], 3)}: {len(rows)} rows of {len(sheet)} moments"]

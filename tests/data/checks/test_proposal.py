@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.data.checks.describe import held_out, proposal, side_of_squares
+from gsparc.data.checks.describe import held_out, neighbours, proposal, side_of_squares
 from gsparc.data.own import load_own, write_own
 
 
@@ -24,6 +24,13 @@ def test_squares_are_a_tenth_of_the_site_or_several_neighbours_wide(tmp_path):
         tmp_path / "b.npz", np.array([[x, y, 1.0] for x in range(0, 60, 10) for y in range(0, 60, 10)])
     )
     assert side_of_squares(sparse) is None and "too few places" in proposal(sparse)
+
+
+def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
+    """Seen from above as well: squares of floor of places at two heights had no least side."""
+    places = np.array([[x, y, z] for x in range(0, 60, 10) for y in range(0, 60, 10) for z in (1.0, 2.0)])
+    assert neighbours(np.repeat(places[::2], 3, axis=0), None).startswith("the nearest other place is 10 m")
+    assert side_of_squares(powers(tmp_path / "a.npz", places)) is None
 
 
 def test_one_place_alone_has_no_squares(tmp_path):

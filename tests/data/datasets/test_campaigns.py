@@ -78,13 +78,12 @@ def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
 
 
 TECHTILE = {
-    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc: csi_imag, rover_z missing in a Techtile"),
+    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc, csi_imag: missing; expected real numbers (E, C, H)"),
     "one experiment of two": ({"csi_real": (("h", "c"), np.zeros((3, 8)))},
         "csi.nc, csi_imag: expected shape (E, C, H)"),
     "transposed": (
         {"csi_imag": (("h", "c", "e"), np.zeros((3, 8, 2)))},
-        "csi.nc, csi_imag: expected shape (E, C, H) with E = 2 as in csi_real, C = 8 as in csi_real, "
-        "H = 3 as in csi_real, found (3, 8, 2); transposed?",
+        "csi.nc, csi_imag: expected shape (E, C, H), here (2, 8, 3), found (3, 8, 2); transposed?",
     ),
     "another host": ({"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
         "techtile_antenna_locations.yml: no antenna of the tiles G99"),

@@ -264,8 +264,8 @@ def test_rfid_lists(tmp_path, refused):
     assert [rows.tolist() for rows in data.release_split] == [[0, 2], [1]]
     (tmp_path / "list.csv").write_text("spectrum,split\n00002,train\n7,test\n3,maybe\n")
     refused(
-        "list.csv, line 3: expected the number of a spectrum, 1 to 6",
+        "list.csv, column 'spectrum', line 3: expected the number of a spectrum, 1 to 6",
         lambda p: load_rfid(p, listed=tmp_path / "list.csv"),
         root,
     )
-    refused("no.csv: missing", lambda p: load_rfid(p, listed=tmp_path / "no.csv"), root)
+    refused("no.csv: no such file", lambda p: load_rfid(p, listed=tmp_path / "no.csv"), root)

@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 
 import gsparc
 from gsparc.commands.train import begin
-from gsparc.data.splits import Fold, Split, indices_hash, write_split
+from gsparc.data.split_files import write_split
+from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.experiment.done import (
     FAILURE,
     State,

@@ -46,7 +46,7 @@ MORE = {
     "spectrum is a folder": (lambda r: [(r / "spectrum/00003.png").unlink(), (r / "spectrum/00003.png").mkdir()],
                              "00003.png"),
     "csv is a folder": (lambda r: [(r / "tx_pos.csv").unlink(), (r / "tx_pos.csv").mkdir()], "tx_pos.csv"),
-    "csv with semicolons": (lambda r: (r / "tx_pos.csv").write_text("x;y;z\n0;0;1\n"), "expected the header"),
+    "csv with semicolons": (lambda r: (r / "tx_pos.csv").write_text("a;b;c\n0;0;1\n"), "expected the header"),
     "csv with a quote left open": (rewrite("tx_pos.csv", "0.3000", '"0.3000'), "line"),
     "index is a folder": (lambda r: [(r / "test_index.txt").unlink(), (r / "test_index.txt").mkdir()],
                           "test_index.txt"),

@@ -1,0 +1,61 @@
+"""Splits as JSON index files, which a run writes as split.json and `split=file` reads."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.errors import DataError, reason
+from gsparc.data.files import whole_file
+from gsparc.data.splits import Fold, Split, indices_hash
+
+log = logging.getLogger(__name__)
+
+
+def write_split(
+    path: str | Path, split: Split, rows: int, dataset_sha256: str = "", run_id: str | None = None
+) -> None:
+    """Store a split of `rows` rows as a JSON index file (atomically), with the run that made it."""
+    facts = {"schema": 1, "name": split.name, "rows": rows, "dataset_sha256": dataset_sha256}
+    facts |= {} if run_id is None else {"run_id": run_id}
+    folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
+    content = {**facts, "sha256": split.sha256, "folds": folds}
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
+
+
+def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
+    """Read an index file for a dataset of `rows` rows; warns when it was made for other data.
+
+    Raises:
+        DataError: not an index file, made for another number of rows, edited, or with overlapping parts.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        folds = tuple(
+            Fold(*(np.array(f[k], dtype=np.int64).reshape(-1) for k in ("train", "val", "test")))
+            for f in content["folds"]
+        )
+        name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
+    # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
+    if stored_rows != rows:
+        raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
+    for i, fold in enumerate(folds):
+        every = np.concatenate([fold.train, fold.val, fold.test])
+        if len(np.unique(every)) != len(every):
+            raise DataError(f"{path}: fold {i} names a row twice (train, val and test must be disjoint)")
+        if len(every) and (every.min() < 0 or every.max() >= rows):
+            raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
+    if not folds or indices_hash(folds) != stored_hash:
+        raise DataError(f"{path}: the indices do not match their sha256; the file was edited or damaged")
+    if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
+        log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
+    return Split(name, folds, stored_hash)
