@@ -7,7 +7,6 @@ search proposes, and refines by phases of channels, `SightedSources` conditions 
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import replace
 from typing import Any
@@ -30,8 +29,6 @@ from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
-
-log = logging.getLogger(__name__)
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
 MIN_SEEN, MAX_SOURCES = 2, 60
@@ -204,7 +201,6 @@ def where_rays_meet(limit: int, seed: int, data: Measurements, rows: np.ndarray)
     one = DirectionalGP(limit, seed)
     try:
         one.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-    except ValueError as error:
-        log.info("sources are searched for without directions: %s", error)
+    except ValueError:  # the candidate of rays says why
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0)
     return one.posterior.positions.points + one.frame.middle, one.posterior.power.sqrt()

@@ -89,12 +89,11 @@ class Search:
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:
-            places, amplitude = found
+            places, amplitude = (each[: settings.max_sources - 1] for each in found)
             images = (places - transmitter).norm(dim=1) > 2 * orders.MIN_IMAGE_SHIFT_M
-            planes = bisector(transmitter, places[images])[: settings.max_sources - 1]
+            planes = bisector(transmitter, places[images])
             words: list[Reflections] = [(i,) for i in range(len(planes))]
-            amplitude = amplitude[images][: len(planes)]
-            self.scene = replace(self.scene, planes=planes).with_sequences(words, amplitude)
+            self.scene = replace(self.scene, planes=planes).with_sequences(words, amplitude[images])
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
