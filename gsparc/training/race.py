@@ -1,22 +1,26 @@
-"""Candidates race on rows that all of them left out: what is surely behind, and hardly gains, ends."""
+"""Candidates race on rows that all left out: one ends where its mean with the best could gain too little.
+
+Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a candidate learns,
+its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is the most that a mean may
+gain, however far behind the candidate is now: errors themselves say nothing about that (J. M. Bates and
+C. W. J. Granger, "The combination of forecasts", 1969, weigh by both).
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
-HOPELESS = 1.5  # times the error of the best candidate: what missed more had no weight in the end
-SURE = 2.0  # standard errors of paired rows
-STALLED = 0.8  # of a candidate's error a look ago: what falls less in a round does not catch up
+LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
+SURE = 1.0  # standard errors of paired rows
+STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 
 
 class Behind(ValueError):
-    """A candidate ends: another is surely better."""
+    """A candidate ends: no mean of it and another is surely better than that."""
 
 
 @dataclass(frozen=True)
@@ -25,48 +29,48 @@ class Race:
 
     Attributes:
         rows: (n,) that it left out.
-        squared, energy: (n,) its squared errors, and what the targets measure.
+        missed: (n, ...) its errors there, real or complex.
+        error: a share of the targets' energy there.
         note: is told of each look at a candidate: what, and its mean squared error per entry.
     """
 
     rows: np.ndarray
-    squared: np.ndarray
-    energy: np.ndarray
+    missed: Tensor
+    error: float
     note: Callable[[str, float], None]
 
     @classmethod
     def of(cls, rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]) -> Race:
         """Return a candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
-        squared, energy = (rowwise(one) for one in (mean - target, target))
-        return cls(rows, squared, energy, note)
+        missed = (mean - target).detach()
+        return cls(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
-    @property
-    def error(self) -> float:
-        """A share of the energy."""
-        return float(self.squared.sum() / max(self.energy.sum(), 1e-30))
-
-    def looked(self, what: str, rows: np.ndarray, squared: np.ndarray, before: float = 0.0) -> float:
-        """Return the error of another candidate where both left rows out, as a share of their energy.
+    def looked(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
+        """Return the mean squared error of another candidate, where both left rows out.
 
         Args:
             what: it is, for the learning curve.
-            rows: (m,) rows, which it missed by `squared` (m,).
-            before: its error a look ago; infinity at the first, 0 at the last.
+            rows: (m,) rows, which it missed by `missed` (m, ...).
+            before: what was returned a look ago; infinity at the first.
 
         Raises:
-            Behind: it is `HOPELESS` and `STALLED`.
+            Behind: it is `STALLED`, and weighing it gains less than `LEAST_GAIN`, even `SURE` errors above.
         """
+        now = mean_square(missed)
+        self.note(what, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
-        energy, missed = max(self.energy[here].sum(), 1e-30), self.squared[here]
-        error, least = float(squared[there].sum() / energy), float(missed.sum() / energy)
-        self.note(what, float(squared.mean()))
-        apart = squared[there] - missed
-        surely = apart.sum() > SURE * apart.std() * math.sqrt(len(apart))
-        if surely and error > max(HOPELESS * least, STALLED * before):
-            raise Behind(f"{what} miss {error:.3f} of the energy of rows held out, another {least:.3f}")
-        return error
+        best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
+        whole = max(float(best.abs().square().sum()), 1e-30)
+        gains = (best * (best - own).conj()).real.double().sum(1) / whole
+        gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
+        if now > STALLED * before and gain + SURE * error < LEAST_GAIN:
+            raise Behind(
+                f"{what}: a mean with what misses {self.error:.3f} of the energy of rows held out would "
+                f"gain {gain:.0%} at most, give or take {error:.0%}"
+            )
+        return now
 
 
-def rowwise(values: Tensor) -> np.ndarray:
-    """Mean square (n,) float64 of each row of values (n, ...), real or complex."""
-    return np.asarray(torch.as_tensor(values).detach().abs().double().square().flatten(1).mean(1))
+def mean_square(values: Tensor) -> float:
+    """Return the mean squared size of entries, real or complex."""
+    return float(values.detach().abs().double().square().mean())

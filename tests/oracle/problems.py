@@ -208,7 +208,7 @@ def snapshots() -> Arrays:
 
 
 # Searches that end by themselves within a second.
-FEW = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
+FEW = ("init.searches=3", "init.search_rows=200", "init.max_sources=8")
 
 PROBLEMS: dict[str, Problem] = {
     "spectra": Problem(lambda: spectra(60, declared=False)),

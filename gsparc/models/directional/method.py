@@ -24,6 +24,7 @@ from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse
 from gsparc.models.image_sources.rows import gather
+from gsparc.models.image_sources.search import Found
 from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
@@ -187,3 +188,19 @@ class DirectionalGP(SourcesInFrame):
     def size(self) -> int:
         """Return the number of sources."""
         return len(self.posterior.power) if self.site is not None else 0
+
+
+def where_rays_meet(limit: int, seed: int, data: Measurements, rows: np.ndarray) -> Found:
+    """Return sources of rows (n,), to start a search from: places [m], local, and amplitudes; maybe none.
+
+    Args:
+        limit, seed: of `DirectionalGP`.
+        data: whose directions are measured.
+        rows: that are known.
+    """
+    one = DirectionalGP(limit, seed)
+    try:
+        one.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+    except ValueError:  # the candidate of rays says why
+        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0)
+    return one.posterior.positions.points + one.frame.middle, one.posterior.power.sqrt()

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from functools import partial
 from itertools import takewhile
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,10 +17,9 @@ from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
-from gsparc.models.image_sources.search import Search, SearchSettings
+from gsparc.models.image_sources.search import Found, Search, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
-from gsparc.training.race import Race, rowwise
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -31,19 +28,15 @@ QUADRATURE = 0.4  # initial `Scene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
-Look = Callable[[Rows, Scene, bool], None]  # of a search, with phases; whether it is the last
+Look = Callable[[Rows, Scene], None]  # of a search, with phases
+Start = Callable[[int], Found | None]
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
 def search_many(
-    row_sets: list[Rows],
-    transmitter: Tensor,
-    settings: SearchSettings,
-    noise_floor: float,
-    budget: TimeBudget,
-    cache: SearchCache,
-    look: Look | None = None,
-) -> list[Member]:
+    row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
+    budget: TimeBudget, cache: SearchCache, look: Look | None = None, start: Start | None = None,
+) -> list[Member]:  # fmt: skip
     """Run one search per set of rows, best first; at least one, others while the budget lasts.
 
     The first two that have reached the noise floor are the last: searches of higher numbers do not start, or
@@ -57,6 +50,7 @@ def search_many(
         budget: effort of each, and what ends all together.
         cache: of finished searches.
         look: at the first search after each of its rounds, and after the last.
+        start: sources to start from, of a search by its number.
 
     Raises:
         Behind: a look says so.
@@ -81,14 +75,15 @@ def search_many(
 
         def last_round() -> bool:
             if look is not None and number == 0:
-                look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor), False)
+                look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
-        search = Search(rows, transmitter, settings, number, last_round)
+        found = None if start is None else start(number)
+        search = Search(rows, transmitter, settings, number, last_round, found)
         scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine(rows, learn_visibility(rows, scene, 10, KernelVisibility()), 20)
         if look is not None and number == 0:
-            look(rows, scene, True)
+            look(rows, scene)
         error = left_out_error(rows, scene)
         hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
         if settings.clutter and not hidden and compact(rows):
@@ -129,17 +124,6 @@ def search_many(
         pool.shutdown(cancel_futures=True)  # waits for the step of each search
         torch.set_num_threads(threads)
     return sorted(members, key=lambda member: member.left_out)
-
-
-def raced(race: Race, group: np.ndarray, missed: Callable[[Rows, Scene], Tensor]) -> Look:
-    """Ends a search (`Behind`) that falls behind at rows `group` (n,) that it left out, and `missed` by."""
-    errors = [math.inf]
-
-    def look(rows: Rows, scene: Scene, last: bool) -> None:
-        what, before = f"{len(scene.sequences)} sources", 0.0 if last else errors[-1]
-        errors.append(race.looked(what, group, rowwise(missed(rows, scene)), before))
-
-    return look
 
 
 def refined(rows: Rows, member: Member) -> Member:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from hashlib import sha256
@@ -19,15 +20,15 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
-from gsparc.models.image_sources.ensemble import Look, at_noise_floor, raced, refined, search_many, weights_of
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.phase_offsets import Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
 from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import Scene
-from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
@@ -36,6 +37,7 @@ from gsparc.models.reduced import MeanOnly
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.race import Race
 from gsparc.training.time_budget import TimeBudget, less_repeatable
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,7 @@ class ImageSourceGP(SourcesInFrame):
     Args:
         budget_s: as `FitContext.budget_s`, where that says nothing [s].
         searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see `SearchSettings`.
+        start: places [m], local, and amplitudes of sources that a search of these measurements starts from.
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
@@ -68,11 +71,11 @@ class ImageSourceGP(SourcesInFrame):
     def __init__(
         self, searches: int = 6, budget_s: float | None = None, search_rows: int = 700, rows: int = 3000,
         margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Offsets = "none",
-        clutter: bool = True, seed: int = 0,
+        clutter: bool = True, seed: int = 0, start: Callable[[Measurements, np.ndarray], Found] | None = None,
     ) -> None:  # fmt: skip
-        self.budget_s, self.settings = (
-            budget_s,
-            SearchSettings(searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed),
+        self.budget_s, self._start = budget_s, start
+        self.settings = SearchSettings(
+            searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
         )
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -122,14 +125,14 @@ class ImageSourceGP(SourcesInFrame):
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
-            look = raced(context.race, group, partial(self._missed, data.batch(group)))
-        members = self._search(row_sets, settings, budget, cache, look)
+            look = partial(self._looked, context.race, group, data.batch(group), [math.inf])
+        members = self._search(row_sets, settings, budget, cache, look, partial(self._found, data, known))
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known)
                 # Factors change little the second time: a refinement does, no other search.
-                members = [refined(row_sets[one.number], one) for one in members]
+                members = [ensemble.refined(row_sets[one.number], one) for one in members]
         rows = self._rows(data, known)
         self._become(rows, members)
         self.held = self._left_out_rows(data, known, members, len(rows))
@@ -145,14 +148,14 @@ class ImageSourceGP(SourcesInFrame):
     def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights."""
         self._conditioned(rows, [member.scene for member in members])
-        self.weights = weights_of(members)
+        self.weights = ensemble.weights_of(members)
         return self
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
-        agree = at_noise_floor([member.left_out for member in members], self.noise_floor)
+        agree = ensemble.at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
         inside = int(scene.scatterers(self.members[0].rows).sum())
@@ -185,20 +188,32 @@ class ImageSourceGP(SourcesInFrame):
         # Search number n is the same however many there are: a resumed run may ask for more.
         settings = replace(self.settings, searches=1, seed=0)
         seed = str(self.settings.seed)
-        return {"data": identity(data), "rows": rows, "seed": seed, "settings": str(settings)}
+        told = f"{settings}, {'alone' if self._start is None else 'from directions'}"
+        return {"data": identity(data), "rows": rows, "seed": seed, "settings": told}
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        look: Look | None = None,
+        *more: Any,
     ) -> list[Member]:  # fmt: skip
-        return search_many(row_sets, self._transmitter(), settings, self.noise_floor, budget, cache, look)
+        still, floor = self._transmitter(), self.noise_floor
+        return ensemble.search_many(row_sets, still, settings, floor, budget, cache, *more)
 
-    def _missed(self, batch: Batch, rows: Rows, scene: Scene) -> Tensor:
-        """What a search's scene misses (n, ...) of a batch that it left out."""
+    def _found(self, data: Measurements, known: np.ndarray, number: int) -> Found | None:
+        """What a search by its number starts from, in the frame."""
+        if self._start is None or data.directions is None:
+            return None
+        places, amplitude = self._start(data, self._kept(known, number))
+        return places - self.frame.middle, amplitude
+
+    def _looked(
+        self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
+    ) -> None:
+        """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
-        return mean - batch.target / self.factors[:, None]
+        missed = mean - batch.target / self.factors[:, None]
+        errors.append(race.looked(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""

@@ -14,7 +14,7 @@ from gsparc.models.image_sources.clutter.blocking import Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, directions
+from gsparc.models.image_sources.scene import Scene, directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
@@ -52,7 +52,9 @@ class Means:
         self.counts = [len(scene.sequences) for scene in scenes]
         self.sources = torch.cat([scene.sources for scene in scenes])
         self.orientations = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
-        numbers = [_kernel_numbers(scene.visibility) for scene in scenes]
+        kernels = [scene.visibility for scene in scenes]
+        # Constant, 6 / angle^2 and 3 / length^2.
+        numbers = [(float(k.constant), 6 * float(k.angle) ** -2, 3 * float(k.length) ** -2) for k in kernels]
         each = torch.repeat_interleave(torch.tensor(numbers), torch.tensor(self.counts), 0)
         constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
         toward = directions(self.places[:, :3], self.sources)
@@ -166,11 +168,6 @@ class RowVariance:
         prior = here.square().sum(2) @ self.power + self.noise
         known = (cross.view(2 * len(here), -1) @ self.root).square().sum(1)
         return (prior - known.view(-1, 2).sum(1)).clamp_min(0), prior
-
-
-def _kernel_numbers(kernel: KernelVisibility) -> list[float]:
-    """Constant, 6 / angle^2 and 3 / length^2."""
-    return [float(kernel.constant), 6 * float(kernel.angle) ** -2, 3 * float(kernel.length) ** -2]
 
 
 def _together(scenes: list[Scene], counts: list[int]) -> tuple[Unfolding, Obstacles]:

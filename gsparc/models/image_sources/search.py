@@ -32,6 +32,7 @@ SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes,
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
 STEPS = 12  # of refinement after each round
 PRUNE = 5.0  # least gain of a source kept [nats]
+Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
 PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
 LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
@@ -74,11 +75,12 @@ class Search:
         settings: how.
         number: of the search, added to the seed of the candidates.
         last_round: asked after every round; no other starts when it says so.
+        found: places (K, 3) float64 [m] of sources to start from, and their amplitudes (K,).
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
-        last_round: Callable[[], bool],
+        last_round: Callable[[], bool], found: Found | None = None,
     ) -> None:  # fmt: skip
         self.rows, self.settings, self.last_round = rows, settings, last_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
@@ -86,11 +88,18 @@ class Search:
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
+        if found is not None and settings.order:
+            places, amplitude = (each[: settings.max_sources - 1] for each in found)
+            images = (places - transmitter).norm(dim=1) > 2 * orders.MIN_IMAGE_SHIFT_M
+            planes = bisector(transmitter, places[images])
+            words: list[Reflections] = [(i,) for i in range(len(planes))]
+            self.scene = replace(self.scene, planes=planes).with_sequences(words, amplitude[images])
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
         self._refine(STEPS)
+        self._find_walls()  # among sources that it starts from
         for number in range(60):
             added = self._add_sequences()
             free = not added

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from gsparc.data.walls import read_walls
@@ -12,7 +13,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.directional.method import DirectionalGP, where_rays_meet
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.mixture.residual import Residual
@@ -27,8 +28,12 @@ Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
 
 
 def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Return image sources of several searches, and a process on what they leave."""
-    method = ImageSourceGP(**_searched(init, clutter, context))
+    """Return image sources of several searches, and a process on what they leave.
+
+    Searches start where measured directions meet, but for `init=sources`, which is without them.
+    """
+    start = None if init.name == "sources" else partial(where_rays_meet, init.rows, context.seed)
+    method = ImageSourceGP(**_searched(init, clutter, context), start=start)
     return Residual(method) if residual else method
 
 

@@ -6,8 +6,6 @@ import functools
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,17 +26,18 @@ from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.race import Behind, Race
+from gsparc.training.race import Behind, Race, mean_square
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
-FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8}
 OPEN_ENDED = ("sources", "bearings", "scene")  # candidates that take what effort they are given
 CLUTTERED = ("sources", "scene", "joint_powers")  # candidates to which `clutter` means something
-SEARCHES = ("sources",)  # of them, those that also give an answer of few sources
+SEARCHES = ("sources",)  # of them, those that race
+NEAR = 0.1  # share of the energy that another solution misses, below which few searches are enough beside it
+BESIDE = 2  # searches then, of the usual effort
 
 
 def fit_all(
@@ -48,9 +47,7 @@ def fit_all(
     """Fit candidates; return them, what each cost, and which settings each read.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution
-    predicts every group from the others (`ClosedForm.held`): errors to weigh them by. A search with
-    few sources is a solution of its own next to the one that takes all its effort: many sources fit rows near
-    others better, few of them what is far.
+    predicts every group from the others (`ClosedForm.held`): errors to weigh them by.
 
     Args:
         parts: candidates by name, which have settings `init`.
@@ -65,58 +62,42 @@ def fit_all(
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
     groups = () if cut is None else _groups(cut, fold.train)
     # Searches come last: they race against the best before them, and end where they fall behind.
-    plans = [(part, init) for part in parts if part not in OPEN_ENDED]
-    for part in (part for part in parts if part in OPEN_ENDED):
-        if several and part in SEARCHES:
-            plans.append((f"few {part}", replace(init, **FEW)))
-        plans.append((part, init))
     fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
     read: dict[str, set[str]] = {}
-    ended: dict[str, str] = {}
     race: Race | None = None
 
     def note(what: str, error: float) -> None:
         context.curve(budget.counted.wall, what, error)
 
-    for name, settings in plans:
-        part = name.split()[-1]
-        if part in SEARCHES:
+    for name in sorted(parts, key=OPEN_ENDED.__contains__):
+        if name in SEARCHES:
             # A resumed run reads finished searches back, however few seconds are left.
             spent = fields and context.resume is None and budget.over()
-            if why := "the seconds were over" if spent else ended.get(part) or _reached(race):
+            if why := "the seconds were over" if spent else _reached(race):
                 log.info("init=%s is left out: %s", name, why)
                 continue
         within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
-        if name.startswith("few "):
-            # Its settings are others: its searches must not stand in the file of the plan that follows.
-            within = replace(within, run_dir=Path(), resume=None)
         try:
-            leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
+            leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
+            near = name in SEARCHES and race is not None and race.error < NEAR
+            settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
             within = replace(within, leave_out=leave_out, race=race)
             with heeded.apart() as read[name], late_when(budget.over):
-                clutter = part not in CLUTTERED or effects.visibility is not False
-                field = parts[part](settings, clutter, effects.residual is not False, within)
+                clutter = name not in CLUTTERED or effects.visibility is not False
+                field = parts[name](settings, clutter, effects.residual is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
-            if part not in OPEN_ENDED:
+            if name not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = comparable(data.batch(field.held.rows).target, data.site)
                 one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
-                if race is None or part not in SEARCHES:
-                    note(name, float(one.squared.mean()))
-                else:
-                    race.looked(name, one.rows, one.squared)
+                note(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
-        except KeyboardInterrupt:
-            if not name.startswith("few "):
-                raise
-            raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
         except ValueError as error:
-            # A `ValueError` too; searches of the same part that follow would fall behind alike.
-            if isinstance(error, Behind):
-                ended[part], reports[name] = str(error), FitReport(budget.counted.wall - began)
+            if isinstance(error, Behind):  # a `ValueError`, too
+                reports[name] = FitReport(budget.counted.wall - began)
             elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
@@ -168,7 +149,9 @@ def weigh_candidates(
     assert cut is not None
     single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
     unit = np.where(cut.unit == NOT_TESTED, single, cut.unit)[rows]
-    weights = solution_weights.weights(predicted, target, unit)
+    # A search that went on has errors of its own: here a mixture need not be surely better, too.
+    sure = 0.0 if set(solutions).intersection(SEARCHES) else 1.0
+    weights = solution_weights.weights(predicted, target, unit, sure)
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
             "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,

@@ -28,16 +28,19 @@ PARTS = 5  # of the units; weights are learned on all but one, and tried on that
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
-def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[float, ...]:
+def weights(
+    predicted: list[Tensor], target: Tensor, unit: np.ndarray, sure: float = 1.0
+) -> tuple[float, ...]:
     """Return weights in [0, 1] of sum one: one alone, unless a mixture is surely better.
 
     Args:
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
         target: (n, ...).
         unit: (n,), rows of one unit are not independent.
+        sure: see `choose_weights`.
     """
     missed = torch.stack([real((one - target).detach()) for one in predicted], 1)  # (n, M, P)
-    chosen = choose_weights((missed @ missed.mT).numpy(), unit)
+    chosen = choose_weights((missed @ missed.mT).numpy(), unit, sure)
     return tuple(float(weight) for weight in chosen)
 
 
@@ -136,14 +139,15 @@ def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
-def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return weights (K,) of predictions: one alone, unless a mixture is better by over a standard error.
+def choose_weights(gram: np.ndarray, unit: np.ndarray, sure: float = 1.0) -> np.ndarray:
+    """Return weights (K,) of predictions: one alone, unless a mixture is better by over `sure` errors.
 
     The mixture is judged on units whose rows its weights were not learned from.
 
     Args:
         gram: (n, K, K) products of the errors of n rows.
         unit: (n,) of the rows, see `paired`.
+        sure: standard errors of the gain.
     """
     errors = np.einsum("nkk->nk", gram)
     winner = int(errors.mean(0).argmin())
@@ -156,7 +160,7 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray) -> np.ndarray:
         here = part == number
         mixed[here] = squared(_pruned(gram[~here].mean(0)), gram[here])
     gain, error = paired(errors[:, winner] - mixed, unit)
-    return _pruned(gram.mean(0)) if gain > error else single
+    return _pruned(gram.mean(0)) if gain > sure * error else single
 
 
 def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:

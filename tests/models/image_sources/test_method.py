@@ -1,6 +1,7 @@
 """The method end to end on rooms whose every source is known."""
 
 import copy
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.prediction.predictor import Predictor
+from gsparc.training import race
 from gsparc.training.context import FitContext
 from gsparc.training.race import Behind, Race
 
@@ -119,14 +121,16 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     assert "1 of 3 searches (ended by the time budget)" in report.notes[0]
 
 
-def test_a_search_far_behind_another_solution_ends(tmp_path):
+def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, monkeypatch):
+    monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
+    monkeypatch.setattr(race, "STALLED", -math.inf)
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
     method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
     group, looks = fold.train[::3], []
     target = data.batch(group).target
-    race = Race.of(group, 1.0001 * target, target, lambda what, error: looks.append((what, error)))
+    another = Race.of(group, 1.1 * target, target, lambda *look: looks.append(look))
     with pytest.raises(Behind, match="of the energy of rows held out"):
-        method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=race))
+        method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=another))
     assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,6 +37,11 @@ def test_equal_errors_share_and_large_ones_have_nothing():
 
 def test_one_far_ahead_predicts_alone():
     assert weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET, EACH) == (1.0, 0.0)
+
+
+def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
+    few = weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
+    assert few == (1.0, 0.0) and 0 < weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
 
 
 def test_rows_of_one_unit_do_not_make_a_mixture():

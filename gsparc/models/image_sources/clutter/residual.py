@@ -150,10 +150,6 @@ class CandidateScorer:
         """Diagonal of K^-1 (n,), mean of both parts."""
         return self.root.square().sum(0).view(2, -1).mean(0)
 
-    def score(self, change: Tensor) -> Tensor:
-        """Return nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
-        return self.score_positive(change)[0]
-
     def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
         """Return nats (m,) of adding waves (n, K), times each `share` (b, K, n) under b of m candidates."""
         scores = []
@@ -161,11 +157,11 @@ class CandidateScorer:
             raise_if_cancelled()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
-            scores.append(self.score(torch.complex(*change)))
+            scores.append(self.score_positive(torch.complex(*change))[0])
         return torch.cat(scores)
 
     def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same, and the multiples (M,)."""
+        """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain, and these."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)

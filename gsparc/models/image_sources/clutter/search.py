@@ -221,7 +221,7 @@ class _ClutterSearcher:
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
         inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
         seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
-        scores = scorer.score(trial.unobstructed(self.rows) * seen.T * self._turns(trial))
+        scores, _ = scorer.score_positive(trial.unobstructed(self.rows) * seen.T * self._turns(trial))
         total = scores.view(len(moves), -1).sum(1)
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
-from gsparc.models.image_sources.ensemble import Look, compact, left_out_error
+from gsparc.models.image_sources.ensemble import compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
@@ -61,7 +61,7 @@ class KnownWallsGP(ImageSourceGP):
 
     def _search(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        look: Look | None = None,
+        *unused: Any,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search."""
         rows = row_sets[0]
