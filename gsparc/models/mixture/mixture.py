@@ -23,7 +23,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
-from gsparc.models.channels.complex_gp import ComplexGP
+from gsparc.models.channels.initial import factors_of_runs
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
@@ -340,8 +340,7 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
     """Factors of several runs of channels, by the waves that explain rows (n,); else none."""
     if not RunFactors.several(data, known):
         return RunFactors.none()
-    waves = ComplexGP()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
-    waves.fit(data, Fold(known, known[:0], known[:0]), context)
-    log.info("channels of %d runs: the factor of each was estimated by a process of waves", len(waves.runs))
-    return waves.runs
+    result = factors_of_runs(data, known, context.time_budget())
+    log.info("channels of %d runs: the factor of each was estimated by waves that explain all", len(result))
+    return result
