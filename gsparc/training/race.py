@@ -2,7 +2,7 @@
 
 Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a candidate learns,
 its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is the most that a mean may
-gain, however far behind the candidate is now: errors themselves say nothing about that (J. M. Bates and
+gain, however far behind the candidate is now: errors say little about that (J. M. Bates and
 C. W. J. Granger, "The combination of forecasts", 1969, weigh by both).
 """
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
 SURE = 1.0  # standard errors of paired rows
+FAR = 5.0  # times the error of the best: what stalls there has a part of its own that will not fall
 STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 
 
@@ -54,7 +55,8 @@ class Race:
             before: what was returned a look ago; infinity at the first.
 
         Raises:
-            Behind: it is `STALLED`, and weighing it gains less than `LEAST_GAIN`, even `SURE` errors above.
+            Behind: it is `STALLED` while `FAR` behind, or weighing it gains less than `LEAST_GAIN`, even
+                `SURE` errors above.
         """
         now = mean_square(missed)
         self.note(what, now)
@@ -63,11 +65,13 @@ class Race:
         whole = max(float(best.abs().square().sum()), 1e-30)
         gains = (best * (best - own).conj()).real.double().sum(1) / whole
         gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
-        if now > STALLED * before and gain + SURE * error < LEAST_GAIN:
-            raise Behind(
-                f"{what}: a mean with what misses {self.error:.3f} of the energy of rows held out would "
-                f"gain {gain:.0%} at most, give or take {error:.0%}"
-            )
+        if now <= STALLED * before:
+            return now
+        known = f"what misses {self.error:.3f} of the energy of rows held out"
+        if now > FAR * mean_square(best):
+            raise Behind(f"{what}: {now / mean_square(best):.0f} times the error of {known}")
+        if gain + SURE * error < LEAST_GAIN:
+            raise Behind(f"{what}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}")
         return now
 
 

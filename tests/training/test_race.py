@@ -15,16 +15,23 @@ def race(looks=None):
     return Race.of(ROWS, target + OWN[0], target, lambda *look: None if looks is None else looks.append(look))
 
 
-def test_a_candidate_far_behind_goes_on_where_its_errors_are_its_own():
+def test_a_candidate_behind_goes_on_where_its_errors_are_its_own():
     looks = []
     one = race(looks)
     assert one.error == pytest.approx(0.01, rel=0.2)
-    one.looked("far", ROWS, 5 * OWN[1])
-    assert looks == [("far", pytest.approx(25, rel=0.2))]
+    one.looked("behind", ROWS, 1.5 * OWN[1])
+    assert looks == [("behind", pytest.approx(2.25, rel=0.2))]
+
+
+def test_a_candidate_ends_that_stays_far_behind():
+    one = race()
+    with pytest.raises(Behind, match=r"^far: \d+ times the error of what misses 0\.0"):
+        one.looked("far", ROWS, 5 * OWN[1], 25.0)
+    assert one.looked("falling", ROWS, 5 * OWN[1], 100.0) == pytest.approx(25, rel=0.2)
 
 
 def test_a_candidate_ends_that_misses_what_the_best_misses():
-    with pytest.raises(Behind, match=r"^near: a mean with what misses 0\.0\d+ .* would gain -?\d+% at most"):
+    with pytest.raises(Behind, match=r"^near: a mean with what misses 0\.0\d+ .* gains -?\d+% at most"):
         race().looked("near", ROWS, OWN[0] + 0.1 * OWN[1])
     assert race().looked("falling", ROWS, OWN[0] + 0.1 * OWN[1], 3.0) == pytest.approx(1, rel=0.2)
 
