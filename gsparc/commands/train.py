@@ -191,8 +191,13 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
-        if given and not is_address(given):
-            config.dataset[key] = str(Path(config.dataset[key]).resolve())
+        if given:
+            several = OmegaConf.is_list(given)
+            whole = [
+                one if is_address(one) else str(Path(one).resolve())
+                for one in (given if several else [given])
+            ]
+            config.dataset[key] = whole if several else whole[0]
     if start is not None:
         try:
             module.measurements = aligned(module.measurements, checkpoint.read(start).site)

@@ -177,6 +177,10 @@ class DataModule(pl.LightningDataModule, ABC):
         """Return test rows in order, all of them on every device."""
         return RowsLoader(self.measurements, self._rows().test, self.batch_size)
 
+    def predict_dataloader(self) -> RowsLoader:
+        """Return the test rows; `Trainer.predict` asks for them."""
+        return self.test_dataloader()
+
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move the batch, a frozen dataclass, which Lightning does not move itself."""
         return batch.to(device)

@@ -216,7 +216,9 @@ def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -
     columns: dict[str, Any] = {
         "fold": scores.fold, "row": scores.row, "name": [names[i] for i in scores.row],
         "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
-        "confidence": scores.confidence, "variance": scores.variance, **scores.samples,
+        # In the units of the errors beside it: of what was measured, not of stored targets.
+        "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
+        **scores.samples,
     }  # fmt: skip
     if data.site.static_end is None:
         other = data.tx[scores.row] + data.site.origin

@@ -33,7 +33,8 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
-        return draw_points(true * scale, predicted * scale, title, path, unit)
+        measured = data.side(rows) == 0  # of a silent row the target is its level
+        return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
     assert data.site.grid is not None
     known = [said.confidence.numpy() for _, _, said in told if said.confidence is not None]
     confidence = np.concatenate(known)[back] if known else None

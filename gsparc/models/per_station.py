@@ -302,6 +302,7 @@ class PerStation(Method):
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self.factory.made_as(part["target"])
+            copy.name = self.name
             copy.restore(self._site_of(site, int(number)), part["state"])
 
     def objects(self) -> SiteObjects:

@@ -90,7 +90,7 @@ def test_each_problem_is_one_line(tmp_path, arrays):
     good, text = _said(tmp_path / "bad.npz")
     lines = text.strip().splitlines()
     assert not good and len(lines) == 4
-    assert "did you mean mask" in lines[0] and "row 7" in lines[1] and "row 4" in lines[2]
+    assert "did you mean 'mask'" in lines[0] and "row 7" in lines[1] and "row 4" in lines[2]
     assert lines[3].endswith("bad.npz: refused, 3 problems")
 
 

@@ -72,6 +72,16 @@ def test_two_drives_are_learned_as_one(tmp_path):
         _ = datamodule({"name": "own", "file": [str(tmp_path / "a.csv"), how["stations_file"]]}).measurements
 
 
+def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path):
+    """Every cell of the drive was said to be in no list."""
+    rng, cells = np.random.default_rng(0), [["A", 7, 0, 0], ["B", 8, 90, 0], ["C", 7, 9e4, 0]]
+    rows = [[*rng.uniform(0, 90, 2).round(1), 7 + i % 2, -70 - i % 9] for i in range(40)]
+    drive = write(tmp_path / "drive.csv", ["x", "y", "PCI", "RSRP [dBm]"], rows)
+    listed = write(tmp_path / "sites.csv", ["name", "PCI", "x", "y"], cells)
+    with pytest.raises(DataError, match=r"PCI 7 names A, C of the list of stations; leave only"):
+        read_any(drive, stations_file=listed)
+
+
 def test_cells_that_a_list_lacks_are_counted(tmp_path):
     _, drive, heads, sites = drive_of(tmp_path)
     seen = {(row[2], row[3]) for row in csv.reader(drive.open())}

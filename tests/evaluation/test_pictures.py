@@ -1,10 +1,13 @@
 """Every kind of target leaves a picture of its test rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from gsparc.data.splits import Fold
+from gsparc.evaluation import pictures
 from gsparc.evaluation.pictures import draw_points, draw_predictions
 from gsparc.models.baselines.mean import Mean
 from gsparc.training.context import FitContext
@@ -20,6 +23,17 @@ def test_test_rows_are_drawn(campaign, tmp_path, kind):
     draw_predictions(method, data, fold, "title", tmp_path / "deep" / "test.png")
     with Image.open(tmp_path / "deep" / "test.png") as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
+
+
+def test_levels_of_silent_rows_were_drawn_as_measured(campaign, tmp_path, monkeypatch):
+    data = campaign("rssi")
+    rows, drawn = np.arange(len(data)), []
+    data = replace(data, censored=(rows % 4 == 1).astype(np.int8))
+    monkeypatch.setattr(pictures, "draw_points", lambda target, *rest: drawn.append(target))
+    fold, method = Fold(rows[::2], rows[:0], rows[1::2]), Mean()
+    method.fit(data, fold, FitContext(tmp_path))
+    draw_predictions(method, data, fold, "title", tmp_path / "test.png")
+    assert len(drawn[0]) == len(rows[3::4])
 
 
 def test_silent_channels_do_not_break_the_picture(tmp_path):

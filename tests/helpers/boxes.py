@@ -1,7 +1,5 @@
 """Spectra that a moving array measures in an exact box, with their truth."""
 
-import dataclasses
-
 import numpy as np
 from shoeboxes import scatter
 
@@ -17,19 +15,19 @@ SETTINGS = SpectrumSettings(height=30, width=120)
 TONES = 2.4e9 + np.linspace(-100e6, 100e6, 16)
 
 
-def room_of_spectra(count: int = 160, **changes: float) -> Measurements:
-    """`count` receivers over the floor; `changes` are of `SpectrumSettings`."""
+def room_of_spectra(count: int = 160, power: bool = False) -> Measurements:
+    """`count` receivers over the floor; of powers in place of amplitudes."""
     engine = ShoeboxEngine(ROOM, TRANSMITTER, 2.4e9)
     receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
     paths = engine.trace(receivers, engine.supported(PropagationEffects(depth=2)))
-    settings = dataclasses.replace(SETTINGS, **changes)
-    pictures, _ = spectra(paths, settings, TONES, engine.wavelength)
+    pictures, _ = spectra(paths, SETTINGS, TONES, engine.wavelength)
+    pictures = pictures**2 if power else pictures
     return from_arrays(
         {
             "rx_position": receivers,
             "tx_position": TRANSMITTER,
             "spectrum": np.round(pictures * 255).astype(np.uint8),
-            "array_position": settings.elements(engine.wavelength),
+            "array_position": SETTINGS.elements(engine.wavelength),
             "carrier_hz": np.array(2.4e9),
         },
         {"name": "box", "normalisation": "max"},

@@ -151,6 +151,7 @@ class StationList:
         extra: (T,) arrays by name: `PER_STATION`.
         index: (S,) which station each row of another table is of; None where each has a column there.
         aliases: other names of all of them.
+        repeated: names that several of them share, by the head of their column.
     """
 
     names: tuple[str, ...]
@@ -158,6 +159,18 @@ class StationList:
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     index: np.ndarray | None = None
     aliases: tuple[tuple[str, ...], ...] = ()
+    repeated: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def shared(self, words: np.ndarray) -> str | None:
+        """Return what is wrong where words (S,) are of a column whose names several stations share."""
+        known = set(words.tolist())
+        for head, names in self.repeated.items():
+            twice = [name for name in dict.fromkeys(names) if names.count(name) > 1 and name in known]
+            if twice and len(known & set(names)) > len(known & set(self.names)):
+                which = [own for own, name in zip(self.names, names, strict=True) if name == twice[0]]
+                advice = "leave only those of the area in the list, or say dataset.columns.station=HEAD+HEAD"
+                return f"{head} {twice[0]} names {some(which)} of the list of stations; {advice}"
+        return None
 
     def called(self, words: np.ndarray) -> StationList:
         """Return the same under the names that most of words (S,) are of, its own first."""
@@ -216,7 +229,9 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None, notes
     names = sheet.joined(c.head for c in chosen["station"])
-    other = [each for each in (_named(sheet, heads) for heads in aliases) if len(set(each)) == len(each)]
+    every = {"+".join(heads): _named(sheet, heads) for heads in aliases}
+    other = [each for each in every.values() if len(set(each)) == len(each)]
+    repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
     # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
     if other and len(set(names.tolist())) < len(names) and (names != "").all():
         names = np.array(other[0])
@@ -228,7 +243,8 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
     facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
     extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
-    return StationList(tuple(map(str, names)), coordinates, extra, aliases=tuple(other)), notes
+    listed = StationList(tuple(map(str, names)), coordinates, extra, None, tuple(other), repeated)
+    return listed, notes
 
 
 def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:

@@ -366,6 +366,8 @@ class Builder:
     def _all_listed(self, words: np.ndarray, head: str | None) -> None:
         """Refuse names that the list of stations does not have."""
         assert self.listed is not None
+        if (wrong := self.listed.shared(words)) is not None:
+            return self.refuse(wrong)
         lacking: list[str] = []
         if head is not None:
             self.listed, lacking, said = self.listed.with_lacking(words)

@@ -105,7 +105,7 @@ def plan(
     Args:
         problems: the most wanted first; one of several draws of a split gives a method its seed.
         methods: who takes part.
-        budgets: the most wanted first.
+        budgets: the most wanted first, which splits that none of them names have, too.
         only: patterns of `str(cell)`; empty for all.
 
     Raises:
@@ -122,10 +122,14 @@ def plan(
     longest = max((b.seconds for b in budgets), default=0.0)
     # First seeds of all budgets before second ones.
     turns = ((n, b) for n in range(max((len(b.seeds) for b in budgets), default=0)) for b in budgets)
+    named = {split for budget in budgets for split in budget.splits}
     for turn, budget in ((n, b) for n, b in turns if n < len(b.seeds)):
         for problem, those in able:
+            # A split that no budget names has the first: a table without our row would mislead.
+            of = not budget.splits or problem.split in budget.splits
+            of |= budget is budgets[0] and problem.split not in named
             # A drawn split has its draws for seeds: further seeds would repeat the first draw.
-            if (budget.splits and problem.split not in budget.splits) or (turn and problem.draw is not None):
+            if not of or (turn and problem.draw is not None):
                 continue
             seed = budget.seeds[turn] if problem.draw is None else problem.draw
             cells += [

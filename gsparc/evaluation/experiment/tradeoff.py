@@ -33,6 +33,7 @@ from gsparc.prediction.timing import Call, ClockSettings, interleaved
 log = logging.getLogger(__name__)
 
 CLOSEST_DB = 100.0  # the precision of float32
+LEAST_SPAN = 1.1  # times in latency, below which clocks tell no slope
 PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
 
 
@@ -221,7 +222,7 @@ def facts_of(
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
         "tradeoff/span": best[-1].p50 / best[0].p50,
-        "tradeoff/per_halving": halving,
+        "tradeoff/per_halving": halving if best[-1].p50 > LEAST_SPAN * best[0].p50 else None,
         "tradeoff/figure": figure,
         "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
         "time/copy_ms": copy_ms,

@@ -96,6 +96,8 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
     names = dict.fromkeys(name for one in every.values() for name in one)
     # As text: lists of settings cannot be put into a set.
     vary = [n for n in names if len({str(one.get(n)) for one in every.values()}) > 1]
+    if "model._target_" in vary:  # each model has settings of its own, which its name stands for
+        vary = [n for n in vary if not n.startswith("model.")]
     return {
         setting: ", ".join(f"{name}={one.get(name)}" for name in vary if not groups[setting][0].swept(name))
         for setting, one in every.items()

@@ -86,3 +86,10 @@ def test_every_method_of_the_default_comparison_composes():
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
         named(group, of, {"x": entry})
+
+
+def test_a_split_that_no_budget_names_had_no_row_of_ours():
+    rooms = [problem("a"), problem("a", "drawn")]
+    budgets = [Budget(60, (0,), ("random",)), Budget(12, (0,), ("grouped",))]
+    found = [str(cell) for _, cell in plan(rooms, METHODS, budgets)]
+    assert "a/drawn/fast/60/0" in found and "a/drawn/fast/12/0" not in found

@@ -141,3 +141,13 @@ def test_labels_keep_the_value_that_tells_settings_apart():
     said = [short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
     assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
     assert short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and short("gp") == "gp"
+
+
+def test_settings_of_several_models_were_told_for_each(tmp_path):
+    kinds = ({"model._target_": "a.A", "model.x": 1}, {"model._target_": "b.B", "model.y": 2})
+    runs = [
+        Run(tmp_path, {"model/name": str(i)}, config={**kind, "init.count": i})
+        for i, kind in enumerate(kinds)
+    ]
+    told = "".join(tables.differing(runs).values())
+    assert "init.count=1" in told and "model.x" not in told and "model._target_" not in told

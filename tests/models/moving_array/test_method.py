@@ -121,7 +121,7 @@ def test_powers_are_the_best_that_are_not_negative():
 
 def test_power_spectra_are_recognised(fold, tmp_path):
     method = MovingArrayField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
-    method.fit(room_of_spectra(scale="power"), fold, FitContext(tmp_path))
+    method.fit(room_of_spectra(power=True), fold, FitContext(tmp_path))
     assert method.exponent == 1 and method.residual.axes.shape[0] == 0
 
 
