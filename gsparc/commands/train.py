@@ -22,6 +22,7 @@ from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
 from gsparc.data.checks.describe import in_short
 from gsparc.data.datamodule import DataModule
+from gsparc.data.errors import Caution
 from gsparc.data.files import SUMMARY, is_address, set_aside
 from gsparc.data.instantiate import find, node_of
 from gsparc.data.load import datamodule, split_for
@@ -288,7 +289,7 @@ def _keep(
     """Write the checkpoint of a fold as soon as it is fitted."""
     context = contexts[number]
     for note in report.notes:
-        log_of_models.info("%s", note)
+        log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
         context.curve(report.seconds, fitted.name)
     marks = fitting.marks(report, data, split.folds[number], context)

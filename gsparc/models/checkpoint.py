@@ -21,7 +21,7 @@ from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
 
-VERSION = 1  # of what a checkpoint holds
+VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder

@@ -170,7 +170,7 @@ class PerStation(Method):
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
-            notes += [f"{name}: {note}" for note in reports[turn].notes]
+            notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes]
         limited = less_repeatable(*(one.limited_by for one in reports))
         return FitReport(
             budget.counted.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())

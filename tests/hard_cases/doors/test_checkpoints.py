@@ -152,7 +152,7 @@ def nested(width: int, depth: int) -> list:
 @pytest.mark.parametrize(
     "changes,says",
     [
-        *(({"version": one}, f"of version {one}, this gsparc reads 1; train again") for one in (99, "1", 0, None)),
+        *(({"version": one}, f"of version {one}, this gsparc reads 2; train again") for one in (99, "2", 1, None)),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"site": None}, "incomplete"),

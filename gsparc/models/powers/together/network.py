@@ -17,6 +17,7 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from gsparc.data.errors import Caution
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import LinkRows
@@ -179,10 +180,10 @@ def _turned(
         gained, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
         if abs(said) >= CONTRADICTED_DEG and gained > SURE[0] + SURE[1] * len(part.index):
             found = float((table[t, 0] + said) % 360)
-            notes.append(
+            notes.append(Caution(
                 f"azimuth of {names[t]}: {float(table[t, 0]):.0f} deg is contradicted by its levels, which "
                 f"fit {found:.0f} deg, used instead"
-            )
+            ))  # fmt: skip
             table[t, 0] = found
     return replace(trend, table=table), notes
 
