@@ -15,14 +15,14 @@ FARTHEST = 1e6
 SKEW = 2e-3
 """How far the products of the columns of a pose's rotation may be from those of a rotation."""
 
-# At .01 m 1e5 m are 6e8 px of a degree: a determinant of 1e35 px^4, below float32's 3.4e38.
+# Seen from .01 m, 1e5 m span 6e8 px of a degree: their determinant, 1e35 px^4, is below float32's 3.4e38.
 WIDEST = 1e5
 """Largest standard deviation of a Gaussian [m]; at the near cut its determinant in px still is a float32."""
 
 SHORTEST_QUATERNION = 1e-18
 """A quaternion whose longest component is not longer than this does not turn, in either precision."""
 
-# .99 as in Kerbl et al. 2023: behind a layer of 1 nothing has a gradient, as 1 - alpha divides.
+# .99 as in Kerbl et al. 2023: behind a layer of alpha = 1 the gradient would be divided by 0.
 ALPHA_MAX = 0.99
 """Largest opacity of one layer at one pixel; a clamped layer passes no gradient to geometry or opacity."""
 

@@ -231,7 +231,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:
-    """`data` in the local coordinates and target units, watts or milliwatts, that a model was trained in.
+    """Return `data` in the local coordinates and target units, watts or milliwatts, that a model was trained in.
 
     Raises:
         ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
@@ -332,7 +332,7 @@ def _times(values: Any, factor: float) -> Any:
 def collect(
     paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
 ) -> tuple[Evidence, dict[str, Any]]:
-    """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
+    """Gather evidence of every checkpoint's own test rows, no row twice, and the facts that name them."""
     parts, seen = [], np.zeros(0, np.int64)
     facts: dict[str, Any] = {}
     for path in paths:
@@ -356,7 +356,7 @@ def store(
     spatial: bool,
     seed: int,
 ) -> tuple[confidence.Trusted, str]:
-    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; and how it went."""
+    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; return how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.

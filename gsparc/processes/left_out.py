@@ -75,7 +75,7 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
 def left_out_signal(
     inverse: Tensor, weights: Tensor, disturbance: Tensor, groups: Iterable[Tensor] | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """Return what the signal of all other rows misses of each (n, R), and its variance (n,) without groups.
+    """Return each row less the signal predicted from all others (n, R), and its variance (n,) without groups.
 
     With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r` with the
     residual r of `left_out`: what disturbs others by their order alone is not predicted.

@@ -37,7 +37,7 @@ class Cells:
         return Cells(self.centre[chosen], self.edge[chosen])
 
     def halved(self) -> Cells:
-        """Each in two along every axis."""
+        """Return the cells halved along every axis."""
         corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
         live = self.edge.max(0) > 0
         corners = np.unique(np.where(live, corners, 0.0), axis=0)
@@ -46,7 +46,7 @@ class Cells:
         return Cells(centre.reshape(-1, 3), edge.reshape(-1, 3))
 
     def with_others(self, others: Cells) -> Cells:
-        """Both."""
+        """Return these cells and others."""
         return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
 
     def holding(self, place: np.ndarray) -> int:

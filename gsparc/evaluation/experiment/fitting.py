@@ -47,12 +47,12 @@ class Filled:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Of the results."""
+        """Return the row of the table of results."""
         return rows_of(self.facts)[0]
 
     @property
     def checkpoint(self) -> Path:
-        """Of the first fold."""
+        """Return the file of the first fold's model."""
         return next((file for file in self.folder.glob(f"fold0/{MODEL}")), self.folder / MODEL)
 
 
@@ -108,7 +108,7 @@ Run = Callable[[Prepared, str | None], object]
 
 
 def _tried(run: Run, one: Prepared) -> Filled | str:
-    """The cell, or why it cannot be filled; the other methods' table comes nevertheless."""
+    """The cell, or why it cannot be filled; one failing cell does not stop the table."""
     try:
         return one.filled(once(one.folder, one.state, partial(run, one), reuse=one.reuse))
     except Exception as error:  # any error of a plugin

@@ -259,7 +259,7 @@ def place(
         if len(places) >= count:
             return places[:count]
     fit = f"only {len(places)} of {count} receivers fit into scene.area_m"
-    raise ValueError(f"scene: {fit}; is it inside a building?")
+    raise ValueError(f"scene: {fit}; is that area inside a building?")
 
 
 def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
