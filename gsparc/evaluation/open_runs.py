@@ -231,7 +231,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:
-    """Return `data` in the local coordinates and target units, watts or milliwatts, that a model was trained in.
+    """Return `data` in the local coordinates and target units (watts, milliwatts) that a model was trained in.
 
     Raises:
         ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
@@ -356,7 +356,7 @@ def store(
     spatial: bool,
     seed: int,
 ) -> tuple[confidence.Trusted, str]:
-    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model; return how it went."""
+    """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.

@@ -64,9 +64,7 @@ def compare_places(
             # store=false: the model belongs to the cell and is not to be changed by what is asked of it.
             facts = _facts(folder, {**chosen, **own, "store": False}, locate)
         except ValueError as error:
-            log.warning(
-                "gsparc locate failed for %s, left out of the table: %s", "/".join(names), one_line(error)
-            )
+            log.warning("%s cannot be located, no row of it: %s", "/".join(names), one_line(error))
             continue
         rows += _rows(names, facts)
         done.add(names)

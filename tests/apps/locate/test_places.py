@@ -35,7 +35,7 @@ def test_models_with_a_variance_stand_beside_plain_methods(filled, tmp_path, cap
     found = compared(filled, tmp_path)
     assert found.method.tolist() == ["gp", "nearest"] and found.median_m[0] < found.median_m[1]
     assert found.held.notna().tolist() == [True, False]
-    assert "own/random/idw is not located" in caplog.text
+    assert "own/random/idw cannot be located" in caplog.text
     facts, table = facts_and_table(found)
     assert facts["own/random/nearest/held"] is None and table.row_count == 2
     assert compared(filled[:1], tmp_path, locate=None).equals(found)  # what is kept is not located again
