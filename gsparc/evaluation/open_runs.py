@@ -231,7 +231,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:
-    """Return `data` in the local coordinates and target units (watts, milliwatts) that a model was trained in.
+    """Return `data` in the local coordinates and target units (watts, milliwatts) of a model's training.
 
     Raises:
         ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
