@@ -69,7 +69,8 @@ def fit(
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
         # All problems at once, each of them once.
-        raise DataError("; ".join(dict.fromkeys(refused.problems))) from None
+        said = "; ".join(dict.fromkeys(refused.problems))
+        raise DataError(said.replace("dataset.frequency_hz", "frequency_hz")) from None  # an array here
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)

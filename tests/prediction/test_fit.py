@@ -131,6 +131,7 @@ def test_methods_without_deviations_say_so():
     ({"rx": PLACES, "rssi": POWERS.astype(str), "unit": "mW"}, "rssi: expected real numbers"),
     ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
     ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
+    ({"rx": PLACES, "csi": np.ones((60, 2), complex), "carrier_hz": 1e9}, "or say frequency_hz="),
     ({"rx": PLACES}, "one of"),
     ({"rx": PLACES, "rssi": POWERS, "model": "gps"}, "did you mean 'gp'"),
 ])  # fmt: skip
