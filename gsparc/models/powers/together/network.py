@@ -166,7 +166,7 @@ def _turned(
     rows: LinkRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> tuple[Sectors, list[str]]:
     """Azimuths that rows contradict turned to where they fit, and a note of each."""
-    table, notes = trend.table.clone(), []
+    table, notes = trend.table.clone(), list[str]()
     for t in range(len(table)):
         part = rows.at(np.flatnonzero(rows.places[:, 6] == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
