@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gsparc.evaluation.site_plan import still_ends
 
 INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
+FARTHEST = 4.0  # extents of the places, at which a wall is on the map
 AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them with walls and without
 
 
@@ -28,7 +30,12 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
     ends = still_ends(data)
-    low, high = framed(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
+    points = np.concatenate([places[:, :2], ends])
+    # Walls that stand apart from all places are on the map, too; those far away would make it a dot.
+    middle, extent = points.mean(0), np.linalg.norm(np.ptp(points, axis=0))
+    feet = np.array([foot for _, foot in _upright(objects.planes, origin, middle)]).reshape(-1, 2)
+    points = np.concatenate([points, feet[np.linalg.norm(feet - middle, axis=1) <= FARTHEST * extent]])
+    low, high = framed(points, AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
     axis = axes[0, 0]
@@ -53,23 +60,29 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
 def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
     """Upright planes as lines; returns where the others are, in words."""
     middle, reach = (low + high) / 2, float(np.linalg.norm(high - low))
-    first = True
-    for normal, offset in zip(planes[:, :3], planes[:, 3] + planes[:, :3] @ origin, strict=True):
-        flat = np.linalg.norm(normal[:2])
-        # .3 = sin 17.5 degrees from upright: a plane that leans more is no line from above.
-        if abs(normal[2]) > UPRIGHT:
-            continue
-        # On the plane n.x = d, n_z left out: the line n_xy.x = d is d / |n_xy| from the origin.
-        across = normal[:2] / flat
-        foot = middle + (offset / flat - across @ middle) * across
+    label: str | None = "mirror planes found"
+    for across, foot in _upright(planes, origin, middle):
         ends = foot + np.array([[-1.0], [1.0]]) * reach * np.array([-across[1], across[0]])
-        axis.plot(*ends.T, "-", color="tab:red", lw=1.5, label="mirror planes found" if first else None)
-        first = False
+        axis.plot(*ends.T, "-", color="tab:red", lw=1.5, label=label)
+        label = None
     # Between the two limits planes are neither wall nor floor: not drawn, not listed.
     lying = [n for n in range(len(planes)) if abs(planes[n, 2]) > 1 - UPRIGHT]
     heights = sorted((planes[n, 3] + planes[n, :3] @ origin) / planes[n, 2] for n in lying)
     heights_text = ", ".join(f"{height:.2f}" for height in heights)
     return f"horizontal planes at z = {heights_text} m" if heights_text else ""
+
+
+def _upright(
+    planes: np.ndarray, origin: np.ndarray, middle: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the direction (2,) across each upright plane, and its point nearest to `middle` (2,) [m]."""
+    for normal, offset in zip(planes[:, :3], planes[:, 3] + planes[:, :3] @ origin, strict=True):
+        # .3 = sin 17.5 degrees from upright: a plane that leans more is no line from above.
+        if abs(normal[2]) <= UPRIGHT:
+            # On the plane n.x = d, n_z left out: the line n_xy.x = d is d / |n_xy| from the origin.
+            flat = np.linalg.norm(normal[:2])
+            across = normal[:2] / flat
+            yield across, middle + (offset / flat - across @ middle) * across
 
 
 def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:
