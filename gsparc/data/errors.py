@@ -125,6 +125,6 @@ class Problems(list[str]):
             return None
 
     def raise_if_any(self) -> None:
-        """Raise `DataError` when anything was noted."""
+        """Raise `DataError` when anything was noted, each of it once."""
         if self:
-            raise DataError(self, self.source)
+            raise DataError([*dict.fromkeys(self)], self.source)

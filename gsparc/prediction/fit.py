@@ -68,9 +68,8 @@ def fit(
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
-        # All problems at once, each of them once.
-        said = "; ".join(dict.fromkeys(refused.problems))
-        raise DataError(said.replace("dataset.frequency_hz", "frequency_hz")) from None  # an array here
+        said = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
+        raise DataError(said) from None
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
