@@ -257,9 +257,9 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
-    `outage`, `best_server` (number of the station), `server_chance`, and then the power of each of several
-    stations. The projection is the one that `Georeference` describes, azimuthal equidistant about its place;
-    without an `origin` there is none, and coordinates are metres.
+    `outage`, `best_server` (number of the station; the band's tags name each), `server_chance`, and then the
+    power of each of several stations. The projection is the one that `Georeference` describes, azimuthal
+    equidistant about its place; without an `origin` there is none, and coordinates are metres.
     """
     import rasterio
     from rasterio.transform import from_origin
@@ -282,3 +282,5 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
             # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)
             file.set_band_description(number, name)
+            if name == "best_server":
+                file.update_tags(number, **{str(i): one for i, one in enumerate(raster.stations)})

@@ -25,6 +25,8 @@ def test_read_back_at_the_right_place(tmp_path):
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         assert file.descriptions[0] == "power_db" and file.count == 11
+        named = file.tags(1 + file.descriptions.index("best_server"))
+        assert [named[str(i)] for i in range(len(found.stations))] == list(found.stations)
         for row, column in ((0, 0), (14, 19), (7, 3)):
             x, y = file.xy(len(found.grid.y) - 1 - row, column)
             longitude, latitude = transform(file.crs, "EPSG:4326", [x], [y])
