@@ -45,7 +45,7 @@ def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
     assert len({data.site.sha256, alone.site.sha256, whole.site.sha256}) == 3
     assert load({**config, "truth": config["file"]}).site.sha256 == alone.site.sha256
     elsewhere = replace(whole, rx_position=whole.rx_position + 0.1)
-    with pytest.raises(DataError, match="other receivers"):
+    with pytest.raises(DataError, match="not the receivers or targets"):
         with_true_targets(alone, elsewhere, "dataset.truth=x")
     with pytest.raises(DataError, match="same test rows"):
         with_true_targets(alone, replace(whole, release_split=None), "dataset.truth=x")
