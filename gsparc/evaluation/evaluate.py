@@ -216,7 +216,7 @@ def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -
     columns: dict[str, Any] = {
         "fold": scores.fold, "row": scores.row, "name": [names[i] for i in scores.row],
         "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
-        # In the units of the errors beside it: of what was measured, not of stored targets.
+        # Of what was measured, not of stored targets: channels and spectra have errors in these units.
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
         **scores.samples,
     }  # fmt: skip

@@ -73,10 +73,10 @@ def fit(
     data = allowed(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
-    kind, given = method_class(model), settings or {}
-    for name in given.keys() - arguments(kind):
+    kind, own = method_class(model), settings or {}
+    for name in own.keys() - arguments(kind):
         raise ValueError(f"settings: model={model!r} has no {name!r}{suggest(name, arguments(kind))}")
-    factory = for_stations(kind(**given), data)
+    factory = for_stations(kind(**own), data)
     fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit(factory, data, fold, context)

@@ -67,10 +67,10 @@ class Powers(Mixture):
 
     def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named: Any) -> None:
         super().__init__(*settings, **named)
-        for one in terms if isinstance(terms, Sequence) else [terms]:
+        self.own_terms = tuple(terms) if isinstance(terms, Sequence) else (terms,)
+        for one in self.own_terms:
             if not isinstance(one, Columns):
                 raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
-        self.own_terms = tuple(terms)
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""

@@ -342,5 +342,5 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
         return RunFactors.none()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
     result = factors_of_runs(data, known, context.time_budget())
-    log.info("channels of %d runs: the factor of each was estimated by waves that explain all", len(result))
+    log.info("channels of %d runs: the factor of each was estimated by waves of all runs", len(result))
     return result

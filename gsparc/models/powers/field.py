@@ -96,6 +96,8 @@ class PowerField(ClosedForm):
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
         more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
+        for one in more:  # once: a query has no time for it, nor has `torch.func`
+            one.check(torch.from_numpy(seen.places))
         if self.walls is not None:
             walls = counted(self.walls, site.origin, site.static_position)
             law, notes = law_of(seen, site)

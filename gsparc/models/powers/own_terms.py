@@ -23,17 +23,16 @@ class InWorld(Columns):
     origin: Tensor
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Columns`; of places in local coordinates.
-
-        Raises:
-            ValueError: the term's columns have another shape, or a NaN or an infinity.
-        """
+        """See `Columns`; of places in local coordinates."""
         # Places are of one end (n, 3), or of both (n, 6).
-        result = self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
+        return self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
+
+    def check(self, places: Tensor) -> None:
+        """Raise `ValueError` where columns at places (n, D) [m] have another shape or are not finite."""
+        result = self.columns(places)
         if result.ndim != 2 or len(result) != len(places) or not result.isfinite().all():
             name, shape = type(self.term).__name__, (*result.shape,)
             raise ValueError(f"{name}.columns gave {shape}; ({len(places)}, Q) finite numbers are needed")
-        return result
 
 
 def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:

@@ -77,7 +77,7 @@ def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
             return super().columns(places)[:, 0]
 
     data = town(40)
-    own = {"terms": [Flat(GROVE, STILL)]}
+    own = {"terms": Flat(GROVE, STILL)}  # one alone needs no list
     with pytest.raises(ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"):
         gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings=own)
 
