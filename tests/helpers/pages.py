@@ -63,13 +63,14 @@ class Tiny:
         self.folder, self.made = folder, dict[str, str]()
         square = [[[2, 2], [30, 2], [30, 20], [2, 20], [2, 2]]]
         area = {"type": "Polygon", "coordinates": square}
-        for name in ("campus", "corridors", "roofs"):
+        for name in ("campus", "corridors", "roofs", "streets"):
             (folder / f"{name}.geojson").write_text(json.dumps(area))
         Image.new("L", (1600, 900), 255).save(folder / "floor.png")
         heads = "x,y,z,rssi_dbm,station\n"
         rng = np.random.default_rng(0)
         rows = [f"{x},{y},1.5,{-60 - x},{s}\n" for x, y in rng.uniform(0, 20, (40, 2)) for s in ("a", "b")]
-        (folder / "drive.csv").write_text(heads + "".join(rows))
+        for name in ("drive", "second"):
+            (folder / f"{name}.csv").write_text(heads + "".join(rows))
         (folder / "sites.csv").write_text("name,x,y,z\na,0,0,8\nb,20,20,8\n")
         (folder / "places.csv").write_text("x,y,z\n10,10,1.5\n20,20,1.5\n")
 
@@ -150,7 +151,7 @@ class Tiny:
                 words |= {"dataset.count": "40", "dataset.root": str(self.folder)}
             elif chosen == "argos_sim":
                 words |= {"dataset.stand_in.count": "60", "dataset.stand_in.root": str(self.folder)}
-            elif words.get("dataset.file") != "drive.csv":
+            elif "drive.csv" not in words.get("dataset.file", ""):
                 words["dataset.file"] = self.data(kind)
             if kind == "argos":
                 words |= {"dataset.positions": "true"} if chosen == "argos_sim" else {}
