@@ -89,7 +89,7 @@ grid: setup ## every kind of data with defaults beside the plain methods (two ho
 oracle: setup ## fixed problems fitted and stored anew (tests/oracle/stored), with what moved, old -> new
 	OMP_NUM_THREADS=1 $(RUN) tests/oracle/stored_fits.py
 
-bench: setup ## timings of the kernels as ratios
+bench: setup ## seconds of the kernels beside plain PyTorch
 	$(RUN) -m gsparc bench
 
 cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)

@@ -9,7 +9,6 @@
 #include "query.h"
 #include "similarity.h"
 #include "thaw.h"
-#include "machine_limits.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {

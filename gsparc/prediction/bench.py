@@ -1,0 +1,167 @@
+"""The kernels as `gsparc bench` times them: a room of N Gaussians around a receiver, beside plain PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from gsparc.data.schema import Site
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.losses import spectrum_loss
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.optimizer import OptimizerSettings, optimizer_for
+from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops.channels import channels, summed
+from gsparc.ops.networks import networks, products
+from gsparc.ops.projection import Projection
+from gsparc.ops.settings import IMAGE_CUTOFF
+
+Call = Callable[[], object]
+ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
+GRID = SphereGrid.hemisphere()
+EMISSION = EmissionSettings(EncodingSettings("raw"), 16, "sigmoid", log_distance=True, init_bias=0.0)
+# Dense tensors of one forward pass of 1,000 Gaussians are 1.6 GB: the reference of more is not called.
+MOST_DENSE = 1000
+STEPPED, BATCH = 100, 16  # Gaussians and spectra of a training step
+ANTENNAS, SUBCARRIERS = 64, 26  # of the Argos release
+TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kernel at one size, and the same in plain PyTorch; None where its dense tensors are too large."""
+
+    name: str
+    size: str
+    kernel: Call
+    reference: Call | None = None
+
+
+def model_of(count: int, projection: Projection, backend: str | None = None) -> GaussianModel:
+    """Return a room of `count` Gaussians of all shapes, from nearly transparent to nearly opaque (seeded)."""
+    site = Site(
+        name="bench", kind="spectrum", static_end="tx", grid=GRID, array=None, carrier_hz=None,
+        subcarriers_hz=None, origin=np.zeros(3), box=ROOM, moving_box=ROOM, sha256="",
+    )  # fmt: skip
+    settings = ModelSettings(
+        FieldSettings(count=count, placement="uniform", margin=0.0), EMISSION,
+        AttenuationSettings(inverse_distance=True), raster=RasterSettings(projection, backend=backend),
+    )  # fmt: skip
+    # Seeded without touching the draws of whoever calls.
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(count)
+        model = GaussianModel(settings, site)
+        field = model.gaussians
+        field.log_scales.add_(torch.randn_like(field.log_scales), alpha=0.5)
+        # Normal numbers, once they are normalised, are uniform rotations.
+        field.quats.copy_(torch.randn_like(field.quats))
+        field.opacity_logits.copy_(1.5 * torch.randn_like(field.opacity_logits) - 1)
+    return model
+
+
+def cases(count: int, projection: Projection) -> Iterator[Case]:
+    """Yield the kernels of a field of N Gaussians, two real channels wide."""
+    geometry = tuple(tensor.detach() for tensor in model_of(count, projection).gaussians.geometry())
+    pose, draw = Pose.identity(torch.tensor([0.5, -0.5, 0.2])), torch.Generator().manual_seed(0)
+    features = torch.rand(1, count, 2, generator=draw)
+    how = {"projection": projection, "cutoff": IMAGE_CUTOFF}
+    size = f"{count} {projection}"
+
+    def case(name: str, call: Callable[[str | None], object]) -> Case:
+        return Case(
+            *(name, size, lambda: call(None)), (lambda: call("reference")) if count <= MOST_DENSE else None
+        )
+
+    def forward(backend: str | None) -> Tensor:
+        return rasterize(*geometry, features, pose, GRID, backend=backend, **how).image
+
+    def backward(backend: str | None) -> object:
+        leaves = [tensor.clone().requires_grad_() for tensor in (*geometry, features)]
+        with torch.enable_grad():
+            image = rasterize(*leaves, pose, GRID, backend=backend, **how).image
+            return torch.autograd.grad(image.sum(), leaves)
+
+    def weights(backend: str | None) -> Tensor:
+        # Channels sum over all directions, at half the resolution of images.
+        sphere, cutoff = SphereGrid.full_sphere(90, 180), Cutoff(1e-3, relative=True)
+        seen = make_plan(*geometry, pose, sphere, projection=projection, cutoff=cutoff, backend=backend)
+        return mean_weights(seen, *geometry).share
+
+    def plan(backend: str | None) -> Plan:
+        return make_plan(*geometry, pose, GRID, backend=backend, **how)
+
+    yield case("plan", plan)
+    yield case("plan and blend, moving receiver", forward)
+    frozen = freeze(plan(None), *geometry, version=0)
+    # Plain PyTorch has no frozen views: its own plan, made once, is composited.
+    dense = plan("reference") if count <= MOST_DENSE else None
+    again = dense and (lambda: composite(dense, *geometry, features).image)
+    yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), again)
+    yield case("forward and gradients", backward)
+    yield case("weights of channels", weights)
+    yield from _around(count, draw)
+
+
+def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
+    """What stands beside the rasterizer: networks of emission and the sum of a channel."""
+    emission = model_of(count, "tangent").emission
+    layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
+    encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw))
+    of = f"{count} x {BATCH}"
+    yield Case("emission", of, lambda: networks(encoded, *layers), lambda: products(encoded, *layers))
+    steering = torch.randn(count, ANTENNAS, 2, generator=draw)
+    # Up to 100 ns, as in a room, and in float64: at 2.4 GHz these are 240 turns.
+    delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
+    gains = torch.randn(1, count, 2, generator=draw)
+    yield Case(
+        "channel", f"{count} to {ANTENNAS} x {SUBCARRIERS}",
+        lambda: channels(gains, steering, delays, *TONES, SUBCARRIERS),
+        lambda: summed(gains, steering, delays, TONES, SUBCARRIERS),
+    )  # fmt: skip
+
+
+def loss() -> Case:
+    """Return L1 and SSIM of a batch of spectra with their gradient."""
+    draw = torch.Generator().manual_seed(0)
+    target, shown = (torch.rand((BATCH, GRID.height, GRID.width), generator=draw) for _ in range(2))
+    shown.requires_grad_()
+
+    def convolved() -> Tensor:
+        ssim = structural_similarity_index_measure(shown[:, None], target[:, None], data_range=1.0)
+        assert isinstance(ssim, Tensor)
+        return ssim + (shown - target).abs().mean()
+
+    def gradient(of: Callable[[], Tensor]) -> Call:
+        return lambda: torch.autograd.grad(of(), shown)
+
+    return Case("loss of spectra", str(BATCH), gradient(lambda: spectrum_loss(shown, target).sum()),
+                gradient(convolved))  # fmt: skip
+
+
+def step(projection: Projection, count: int = STEPPED) -> Case:
+    """Return a training step: emission, plan, blending, loss, gradients and Adam."""
+    ours, plain = (_learning(model_of(count, projection, backend)) for backend in (None, "reference"))
+    return Case("training step", f"{count} {projection} x {BATCH}", ours, plain)
+
+
+def _learning(model: GaussianModel) -> Callable[[], Tensor]:
+    optimizer, draw = optimizer_for(model, OptimizerSettings()), torch.Generator().manual_seed(0)
+    target = torch.rand((BATCH, GRID.height, GRID.width), generator=draw)
+    tx = torch.randn(BATCH, 3, generator=draw)
+
+    def call() -> Tensor:
+        optimizer.zero_grad(set_to_none=True)
+        image = model.raster(model.features(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
+        result = spectrum_loss(image.squeeze(1), target).mean()
+        result.backward()
+        optimizer.step()
+        return result.detach()
+
+    return call

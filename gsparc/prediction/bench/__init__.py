@@ -1,1 +1,0 @@
-"""Timings of kernels and queries as ratios to what the machine can do at best."""
