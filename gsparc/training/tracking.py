@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -76,17 +77,20 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     """Return a logger for `logger=wandb`.
 
     Args:
-        offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done.
+        offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done;
+            WANDB_MODE of the environment wins.
         **settings: of Lightning's `WandbLogger`; name, group and tags that are null follow from the job.
     """
     import wandb  # slow to import, and few runs need it
     from lightning.pytorch.loggers import WandbLogger
 
-    stays = not wandb.login(prompt=False) if offline is None else offline
-    # Lightning sets a variable that wandb, once asked for a login, does not read again.
-    mode: dict[str, Any] = {"mode": "offline"} if stays else {}
+    mode = os.environ.get("WANDB_MODE")
+    if mode is None:
+        stays = not wandb.login(prompt=False) if offline is None else offline
+        mode = "offline" if stays else None
     given = {name: value for name, value in settings.items() if value}
-    return WandbLogger(offline=stays, **{**_of_job(), **given, **mode})
+    # As an argument: Lightning's `offline` sets a variable that wandb, once asked for a login, does not read.
+    return WandbLogger(offline=mode == "offline", **{**_of_job(), **given, "mode": mode})
 
 
 def _of_job() -> dict[str, Any]:
