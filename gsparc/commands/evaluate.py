@@ -71,7 +71,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     # All folds of a run share its configuration, and so its seed.
     seed = checkpoint.read(paths[0]).configuration.get("seed")
     facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
-    write_samples(run_dir / "per_sample.csv", evaluation.columns)
+    if evaluation.columns:
+        write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)

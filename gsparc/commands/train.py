@@ -153,7 +153,8 @@ def train(
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(method, data, split, contexts, keep=keep)
                 # Some options are read by answers alone: one query, before unused options are listed.
-                fits.methods[0].predict(data.batch(rows_of(split.folds[0], config.eval_on)[:1]))
+                asked = "train" if split.name == "none" else config.eval_on
+                fits.methods[0].predict(data.batch(rows_of(split.folds[0], asked)[:1]))
 
             unused = options.unheeded(reads, fits.methods[0], data)
             evaluation = evaluate(
@@ -168,8 +169,9 @@ def train(
             objects = Objects(fits.methods, files, data, split, evaluation)
             if in_full:
                 _draw(loggers, config, facts, objects, run_dir)
-        samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
-        summary.write_samples(run_dir / "per_sample.csv", samples)
+        if evaluation.columns:
+            samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
+            summary.write_samples(run_dir / "per_sample.csv", samples)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, objects
 
@@ -324,11 +326,12 @@ def _draw(
     }
     tracking.final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
-    draw_predictions(
-        method, data, fold, f"{data.site.name}: test rows of {method.label}", run_dir / "test.png"
-    )
-    tracking.picture(loggers, "test rows", run_dir / "test.png")
-    tracking.table(loggers, "results", *summary.result_rows(facts, str(facts["model/label"]), config.eval_on))
+    if len(fold.test):
+        title = f"{data.site.name}: test rows of {method.label}"
+        draw_predictions(method, data, fold, title, run_dir / "test.png")
+        tracking.picture(loggers, "test rows", run_dir / "test.png")
+    table = summary.result_rows(facts, str(facts["model/label"]), config.eval_on)
+    tracking.table(loggers, "results", *table)
     found = method.objects()
     if len(found):
         draw_found(data, found, run_dir / "found.png", _known_walls(config))
@@ -340,7 +343,7 @@ def task(config: DictConfig) -> float:
 
     Returns:
         The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
-            NaN where the data do not tell it and no search asks.
+            NaN where the data, or `split=none`, do not tell it and no search asks.
     """
     hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
     if config.ckpt_path is not None:
@@ -357,7 +360,7 @@ def task(config: DictConfig) -> float:
             work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
             facts = once(run_dir, state, work, unread=unread, **how)
     figure = DECIDING[facts["dataset/kind"]]
-    value = facts[f"{config.eval_on}/{figure}"]
+    value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
         return score_of(figure, value)
     # A search cannot rank a job without its figure; a plain multirun can do without.

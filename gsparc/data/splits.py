@@ -15,7 +15,7 @@ from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, 
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import far_apart, far_from, path_order, square_of, tenth
 
-NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs")
+NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs", "none")
 CORNERS = ("--", "-+", "+-", "++")
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
@@ -58,7 +58,7 @@ class Split:
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""
         for i, fold in enumerate(self.folds):
-            if len(fold.train) < LEAST_ROWS or not len(fold.test):
+            if len(fold.train) < LEAST_ROWS or not (len(fold.test) or self.name == "none"):
                 raise DataError(
                     f"split={self.name}: fold {i} has {len(fold.train)} training and {len(fold.test)} "
                     f"test rows; at least {LEAST_ROWS} and 1 are needed"
@@ -87,7 +87,7 @@ class SplitSettings(Checked):
     gsparc.data.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
 
     Attributes:
-        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations` or `runs`.
+        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations` or `runs`; `none` tests no row.
         seed: of every random choice below.
         val_fraction: share of each fold's training rows kept for validation.
         test_fraction: share of the rows that `random` (without files) and `corner` hold out, and of the runs
@@ -221,6 +221,8 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
     if settings.name == "corner":
         return [_corner(positions, settings)]
     rows = len(positions)
+    if settings.name == "none":
+        return [(np.arange(rows), np.zeros(0, np.int64))]
     if settings.name == "blocks":
         test = _blocks(positions, np.arange(rows), settings, settings.share, [settings.seed])
         return [(np.setdiff1d(np.arange(rows), test), test)]
@@ -356,7 +358,7 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
     keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0
     # A prefix of one permutation: smaller training sets are subsets of larger ones.
     train = train[np.sort(rng.permutation(len(train))[:keep])]
-    if len(train) == 0 or len(test) == 0:
+    if len(train) == 0 or (len(test) == 0 and s.name != "none"):
         raise DataError(
             f"split={s.name}: fold {fold} has {len(train)} training and {len(test)} test rows of "
             f"{len(positions)}; measure more, or change split.buffer_m or the shares"

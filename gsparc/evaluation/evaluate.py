@@ -71,6 +71,8 @@ def evaluate(
         shared: the baseline that the methods are, which is then not fitted again.
         timed: whether latencies are measured.
 
+    Nothing is scored or timed where `split=none` left no test rows.
+
     Returns:
         `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
         `dataset/*`, `split/*`.
@@ -82,6 +84,8 @@ def evaluate(
     seconds = None if train_s is None else [float(s) for s in np.atleast_1d(train_s)]
     if seconds is not None and len(seconds) != len(methods):
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
+    if split.name == "none" and eval_on == "test":
+        return Evaluation(_about(methods, seconds, data, split), {})
     scores = score(methods, data, split, eval_on)
     # Which baselines serve is decided by the rows that they learn from, not by those scored.
     names = fitting(*(learned or (data, split))) if baselines is None else baselines
@@ -107,20 +111,30 @@ def evaluate(
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
     if REFERENCE in others:
         facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
-    facts["time/train_s"] = None if seconds is None else float(np.mean(seconds))
-    facts["time/train_total_s"] = None if seconds is None else float(sum(seconds))
     # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
     if FIELD in every:
-        contenders[FIELD], facts[f"{FIELD}/train_s"] = fields[0], facts["time/train_s"]
-    facts |= timing.machine_facts()
+        contenders[FIELD] = fields[0]
     facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock) if timed else {}
-    first = methods[0]
-    facts |= {"model/name": first.name, "model/label": common_label(first.name, methods)}
-    facts |= {"model/effects": first.effects, **first.facts()}
-    facts |= dataset_facts(data) | split_facts(split) | timing.peak_memory()
     facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
+    facts |= _about(methods, seconds, data, split)
+    if FIELD in every:
+        facts[f"{FIELD}/train_s"] = facts["time/train_s"]
     return Evaluation(facts, _columns(scores, others, data))
+
+
+def _about(
+    methods: Sequence[Method], seconds: Sequence[float] | None, data: Measurements, split: Split
+) -> dict[str, Any]:
+    """`model/*`, `dataset/*`, `split/*`, `machine/*`, `memory/*` and the seconds of training."""
+    first = methods[0]
+    return {
+        "model/name": first.name, "model/label": common_label(first.name, methods),
+        "model/effects": first.effects, **first.facts(),
+        "time/train_s": None if seconds is None else float(np.mean(seconds)),
+        "time/train_total_s": None if seconds is None else float(sum(seconds)),
+        **dataset_facts(data), **split_facts(split), **timing.machine_facts(), **timing.peak_memory(),
+    }  # fmt: skip
 
 
 def paired_differences(scores: Scores, reference: Scores, name: str) -> dict[str, float | None]:
