@@ -13,35 +13,32 @@ import pandas as pd
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.shared.output import finish, run_directory, show
+from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.commands.train import begin, train
 from gsparc.data.files import platform_cache
-from gsparc.data.limits import choice
+from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan, plugged
 from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
-from gsparc.evaluation.experiment.places import compare_places, facts_and_table
 from gsparc.evaluation.experiment.problem import named, problems_of
 from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 
 def task(config: DictConfig) -> pd.DataFrame:
-    """Fill the cells that are asked for and not there yet, then time all methods, or locate; and report."""
+    """Fill the cells that are asked for and not there yet, then time all methods and report."""
     RunSettings.of(config)
     run_dir = run_directory()
     settings = plain(config)
-    choice("predict", "locate").check("task", settings["task"])
-    locating = settings["task"] == "locate"
+    for form in settings["figures"]:  # now: the pictures come after hours of training
+        PRINTED.check("figures", form)
     methods = plugged() | named("methods", Contender, settings["methods"])
     folder = settings["cells"]
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
-    paths = [(own or {}).get(key) for own in settings["datasets"].values() for key in ("root", "file")]
-    only_prints = locating and settings["locate"]["fingerprints"] and not any(paths)
-    problems = [] if only_prints else problems_of(settings)
+    problems = problems_of(settings)
     budgets = [
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
@@ -55,18 +52,11 @@ def task(config: DictConfig) -> pd.DataFrame:
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, run, bool(settings["train"]), limit_s)
-        if locating:
-            from gsparc.commands.locate import locate  # here: the core compares without the apps
-
-            errors = compare_places(filled, settings["locate"], cells_dir, locate)
-            write_samples(run_dir / "places.csv", {name: errors[name].tolist() for name in errors})
-            finish(run_dir, *facts_and_table(errors))
-            return errors
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
     timed = timed_here(filled, by_name) if settings["latency"] else {}
-    return report(filled, timed, str(settings["ours"]), run_dir)
+    return report(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
 def run(one: Prepared, left: str | None) -> None:
@@ -80,9 +70,12 @@ def run(one: Prepared, left: str | None) -> None:
 
 
 def report(
-    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
-) -> pd.DataFrame:
+    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path,
+    figures: Sequence[str] = (),
+) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
+
+    `figures` are formats beside PNG, see `drawing.save`.
 
     Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
     """
@@ -95,9 +88,9 @@ def report(
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
     for here in by_set:
-        draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png")
+        draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
     if not rows.draws.all():
-        draw_budgets(rows[~rows.draws], run_dir / "compare.png", ours)
+        draw_budgets(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
     for block in blocks:
         budget = block.budget_s.max()

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
+from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.report.page import refresh, studies, write
 from gsparc.evaluation.report.runs import columns, find_runs, retime
 from gsparc.evaluation.summary import program, provenance, write_summary
@@ -21,6 +22,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Write one page about runs; return the facts written to `summary.json` in the run directory."""
     if OmegaConf.is_missing(config, "runs"):
         raise ValueError("no run is named; say gsparc report RUN..., folders of runs or of whole sweeps")
+    for form in config.figures:
+        PRINTED.check("figures", form)
     paths = [Path(path) for path in config.runs]
     runs = find_runs(paths)
     # Times of other days and machines do not compare: every model is asked anew, here.
@@ -30,7 +33,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     sections = studies(runs, _fronts(paths))
     origin = provenance()
     note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
-    write(out, config.title, note, sections)
+    write(out, config.title, note, sections, config.figures)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
     for run in runs:
         stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.data.files import whole_file
+from gsparc.data.limits import choice
 
 # Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).
 PALETTE = (
@@ -34,6 +36,9 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.3,
 }
+
+
+PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 
 class Look(NamedTuple):
@@ -131,7 +136,8 @@ def logarithmic(axes: Any, fine: bool | None = None) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def save(figure: Figure, path: Path, dpi: float = 110) -> None:
-    """Write a figure as PNG, atomically."""
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=dpi, format="png")
+def save(figure: Figure, path: Path, dpi: float = 110, also: Iterable[str] = ()) -> None:
+    """Write a figure as PNG, atomically, and beside it in formats for print: `pdf`, `svg`."""
+    for form in ("png", *also):
+        with whole_file(path.with_suffix(f".{form}")) as partial:
+            figure.savefig(partial, dpi=dpi, format=form)

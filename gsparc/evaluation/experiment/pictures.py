@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,11 @@ LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
 
-def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
-    """Accuracy against costs, of rows as of `rows_of`: a line joins the budgets; `ours` has a large mark."""
+def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
+    """Save accuracy against costs, see `save`: a line joins the budgets; `ours` has a large mark.
+
+    `rows` are as of `rows_of`.
+    """
     groups = [here for _, here in rows.groupby("dataset", sort=False)]
     columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
@@ -44,7 +48,7 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str) -> None:
     figure.legend(
         list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
     )
-    save(figure, path)
+    save(figure, path, also=also)
 
 
 def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
@@ -59,8 +63,8 @@ def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
 LINE = 0.34  # height of a method [inch]
 
 
-def draw_splits(rows: pd.DataFrame, path: Path) -> None:
-    """Draw a panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
+def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> None:
+    """Save a panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
     splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
@@ -87,7 +91,7 @@ def draw_splits(rows: pd.DataFrame, path: Path) -> None:
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
     name = rows.dataset.iloc[0]
     figure.suptitle(f"{name}: mean and standard error over draws of the split; the best is dark")
-    save(figure, path)
+    save(figure, path, also=also)
 
 
 def _seconds(value: float) -> str:

@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from jinja2 import Environment
+from matplotlib.figure import Figure
 from PIL import Image
 
 from gsparc.data.files import whole_file
+from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
 from gsparc.evaluation.report.table import Table
@@ -35,6 +37,7 @@ class Study:
         remarks: what a reader must know first.
         tables: in reading order.
         plots: titles and SVG texts.
+        figures: the plots, for files of their own.
         pictures: captions and PNG data in base64.
     """
 
@@ -42,6 +45,7 @@ class Study:
     remarks: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     plots: list[tuple[str, str]] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
     pictures: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -59,12 +63,12 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
-    makers = (tables.results, tables.within_minutes, tables.effects, tables.worst)
+    makers = (tables.results, tables.effects, tables.worst)
     study.tables += [table for table in (make(runs) for make in makers) if table.rows]
-    drawn = plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.learning(runs)
+    study.figures = [plots.pareto(runs, fronts), plots.accuracy_cdf(runs)]
     study.plots = [
         (str(figure.get_label()), _unique_ids(plots.svg(figure), number))
-        for number, figure in enumerate(drawn)
+        for number, figure in enumerate(study.figures)
     ]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
@@ -110,8 +114,10 @@ def html(title: str, note: str, sections: Sequence[Study]) -> str:
     return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
 
 
-def write(folder: Path, title: str, note: str, sections: Sequence[Study]) -> None:
-    """`report.html`, `report.md` and a CSV file per table."""
+def write(
+    folder: Path, title: str, note: str, sections: Sequence[Study], figures: Sequence[str] = ()
+) -> None:
+    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.html").write_text(html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
@@ -122,6 +128,9 @@ def write(folder: Path, title: str, note: str, sections: Sequence[Study]) -> Non
         for table in study.tables:
             file = folder / f"{_slug(study.title)}-{_slug(table.title)}.csv"
             file.write_text(table.csv(), encoding="utf-8")
+        for figure in study.figures if figures else ():
+            name = f"{_slug(study.title)}-{_slug(str(figure.get_label()))}.png"
+            save(figure, folder / name, also=figures)
     (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
 
 
