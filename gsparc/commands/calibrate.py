@@ -53,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
-            stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
+            stored_lines.append(f"{path}: {bound}")
         write_summary(run_dir / "summary.json", facts)
     show(run_dir, *tables(facts), lines=stored_lines)
     return facts

@@ -366,18 +366,23 @@ def store(
     known, kernel = confidence.known_positions(data, fold), confidence.position_kernel(data, fold)
     stored = confidence.Trusted(kind_used, threshold, promise, known, kernel)
     confidence.keep(path, stored)
+    before = confidence.trusted_of(run.stored[0].extra).kind or "the model's own"
+    # Programs that read confidences get another number from now on: it is said.
+    kind_changed = f"confidence={kind_used}, before: {before}; "
     if np.isfinite(threshold):
-        return stored, f"accepted from {threshold:.4g}"
+        of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
+        return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
     if too_few(len(evidence), promise) is not None:
-        return stored, "no threshold keeps the bound"
+        return stored, f"{kind_changed}no threshold keeps the bound"
     bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
     other = laxer(evidence, promise, kind, spatial, seed)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
     )
     return stored, (
-        f"no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse than {limit}, "
-        f"and the others are not told from them surely enough; {hint} kept, more training rows may help"
+        f"{kind_changed}no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse "
+        f"than {limit}, and the others are not told from them surely enough; {hint} kept, more training "
+        "rows may help"
     )
 
 
