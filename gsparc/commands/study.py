@@ -23,7 +23,7 @@ from gsparc.evaluation.experiment.done import State, content
 from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Study, facts_of
-from gsparc.evaluation.summary import run_conditions, shown, table, write_samples
+from gsparc.evaluation.summary import TRAIN_S, run_conditions, shown, table, write_samples
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
@@ -81,7 +81,7 @@ def table_of(rows: pd.DataFrame, title: str) -> Table:
     """Return a table with a line per row; conditions where the study has any."""
     changed = (rows.what != "none").any()
     costs = {
-        "train_s": "train s", "train_cpu_s": "cpu s", "query_ms": "query ms", "query_p95_ms": "p95"
+        "train_s": TRAIN_S, "train_cpu_s": "cpu s/fold", "query_ms": "query ms", "query_p95_ms": "p95"
     }  # fmt: skip
     lines = []
     for row in rows.to_dict("records"):

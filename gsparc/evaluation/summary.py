@@ -25,6 +25,7 @@ PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "sci
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 WITH_SILENT = "rmse_db_with_silent"
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
+TRAIN_S = "train s/fold"  # head of every table: the mean over folds, each of which trains a model
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -114,7 +115,7 @@ def result_rows(
         cells = [shown(value, form) for value, (_, form) in zip(values, wanted, strict=True)]
         cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
         rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *cells])
-    return ["method", *(name for name, _ in wanted), "train s", "query ms p50"], rows
+    return ["method", *(name for name, _ in wanted), TRAIN_S, "query ms p50"], rows
 
 
 def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
@@ -147,15 +148,19 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
-    cost = [f"cost: {facts['time/cost']}"] if facts.get("time/cost") else []
+    folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
+    cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
     if facts.get("model/made") not in (None, facts.get("model/label")):
         cost.insert(0, f"{facts['model/label']}: {facts['model/made']}")
     return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
-    """Stand-ins, rows that were learned from, a training that seconds ended, and a busy machine."""
+    """No test, stand-ins, rows that were learned from, a training that seconds ended, and a busy machine."""
     conditions = []
+    if facts.get("split/name") == "none" and not facts.get("split/test"):
+        count = facts["split/train"] + facts["split/val"]
+        conditions.append(f"nothing was tested: all {count} rows were learned from (split=none)")
     if facts.get("split/foreign"):
         conditions.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("split/without_baselines"):

@@ -94,7 +94,7 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     assert facts["test/skill"] == pytest.approx(1 - squares[0] / squares[1])
     assert not any("decided_by" in key for key in facts) and not decided_by_a_row(facts)
     heads, _ = result_rows(facts, "idw")
-    assert heads == ["method", "rmse_db", "mae_db", "skill", "train s", "query ms p50"]
+    assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
 
 
 def test_standard_error_of_paired_differences(campaign, folds, tmp_path):

@@ -207,8 +207,8 @@ class Study:
             }  # fmt: skip
             facts |= {f"{condition}/{name}": value for name, value in own.items()}
             log.info(
-                "%s, %s, round %d of %d: %s %.4g after %.3g s of training",
-                variant, condition, turn + 1, self.rounds, figure, own["value"], sum(outcome.train_s),
+                "%s, %s, round %d of %d: %s %.4g after %.3g s of training a fold",
+                variant, condition, turn + 1, self.rounds, figure, own["value"], own["train_s"],
             )  # fmt: skip
         write_summary(folder / SUMMARY, {"figure": figure, "seed": seed, **facts, **provenance()})
 

@@ -14,7 +14,7 @@ from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import BUSY, markdown_table, shown
+from gsparc.evaluation.summary import BUSY, TRAIN_S, markdown_table, shown
 
 SECOND: dict[Scored, str] = {
     "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
@@ -182,8 +182,8 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     load = block.load[block.budget_s.notna()].max()
     if load > BUSY:
         lines.append(
-            f"the machine was busy (load up to {load:.1f} per core): train s is inflated, "
-            "cpu s is what was spent"
+            f"the machine was busy (load up to {load:.1f} per core): train s/fold is inflated, "
+            "cpu s/fold is what was spent"
         )
     return lines
 
@@ -233,8 +233,8 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     if not draws:
         columns["seeds"] = column("seeds", "d")
     costs = (
-        ("train_s", "train s", ".3g"), ("train_cpu_s", "cpu s", ".3g"), ("query_ms", "query ms p50", ".3g"),
-        ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
+        ("train_s", TRAIN_S, ".3g"), ("train_cpu_s", "cpu s/fold", ".3g"),
+        ("query_ms", "query ms p50", ".3g"), ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
     )  # fmt: skip
     return columns | {head: column(name, form) for name, head, form in costs}
 

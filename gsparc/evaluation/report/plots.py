@@ -19,7 +19,7 @@ from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import interval
-from gsparc.evaluation.report.tables import curve, grouped, validation_figure
+from gsparc.evaluation.report.tables import grouped
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
@@ -141,28 +141,6 @@ def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] 
         axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
         low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
         axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
-
-
-def learning(runs: Sequence[Run]) -> Figure:
-    """Validation accuracy against seconds of learning; settings of several seeds as a band."""
-    name, axes = validation_figure(runs[0]), _axes()
-    for (setting, group), style in _styled(runs):
-        curves = [curve(run) for run in group]
-        for run, (seconds, values) in zip(group, curves, strict=True):
-            label = setting if run is group[0] else None
-            axes.plot(
-                seconds, values, marker="D" if len(seconds) == 1 else "o", ms=3, lw=1, label=label, **style
-            )
-        # A band needs curves with the same number of looks at validation rows.
-        if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
-            when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
-            axes.fill_between(
-                when.mean(0), every.min(0), every.max(0), color=style["color"], alpha=0.15, lw=0
-            )
-    logarithmic(axes)
-    _accuracy_axis(axes, name)
-    what = "seconds of learning (diamond: trained in one piece, test rows)"
-    return _finished(axes, "Validation accuracy against training time (band: seeds)", what)
 
 
 def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:

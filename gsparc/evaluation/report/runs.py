@@ -34,7 +34,6 @@ class Run:
         folder: its directory.
         facts: `summary.json`.
         samples: `per_sample.csv` by column; empty when absent.
-        curve: `learning_curve.csv` by column, (n,) float64; empty for methods that train in one piece.
         overrides: of the command line, `model.emission.hidden=8`.
         config: composed settings by dotted name.
         render_ms: (n,) times of single queries measured after a sweep, alone; empty when not.
@@ -43,7 +42,6 @@ class Run:
     folder: Path
     facts: dict[str, Any]
     samples: dict[str, np.ndarray] = field(default_factory=dict)
-    curve: dict[str, np.ndarray] = field(default_factory=dict)
     overrides: tuple[str, ...] = ()
     config: dict[str, Any] = field(default_factory=dict)
     render_ms: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -170,7 +168,6 @@ def read_run(folder: Path) -> Run:
         folder,
         facts,
         samples,
-        {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
         tuple(map(str, _written(folder / ".hydra" / "overrides.yaml"))),
         dict(leaves(_written(folder / ".hydra" / "config.yaml") or {})),
         np.zeros(0) if render is None else render,

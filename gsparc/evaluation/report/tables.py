@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of, score_of
+from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of
 from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.table import Column, Interval, Row, Table, interval, over_seeds
+from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
+from gsparc.evaluation.summary import TRAIN_S
 
 WORST = 3
 SETTING = Column("method and setting", of="setting")
 SEED = Column("seed", "d", of="seed")
-TRAIN = Column("train s", ".3g", of="train_s")
+TRAIN = Column(TRAIN_S, ".3g", of="train_s")
 P50 = Column("query ms p50", ".3g", of="query_ms")
 P95 = Column("p95", ".3g", of="query_p95_ms")
 SIZE = Column("Gaussians", "d", of="gaussians")
@@ -124,52 +125,6 @@ def worst(runs: Sequence[Run]) -> Table:
             rows.append([*head, float(own[name][i]), there, float(own["confidence"][i])])
     note = "The moving end's position; the Gaussian process there shows whether it is hard for all."
     return Table("The three worst receivers", columns, rows, note)
-
-
-MINUTES = (1, 2, 5, 10)
-
-
-def within_minutes(runs: Sequence[Run]) -> Table:
-    """Return the best validation figures within fixed training times."""
-    figure = validation_figure(runs[0])
-    score = partial(score_of, figure)
-
-    def best_within(row: Row, minutes: float) -> float | None:
-        seconds, values = curve(row["run"])
-        # Not NumPy's `max`: of some figures the smaller is the better.
-        return max(values[seconds <= 60 * minutes], key=score, default=None)
-
-    head, form = heading_of(figure), form_of(figure)
-    columns = [
-        SETTING, SEED,
-        *(Column(f"{head} within {m} min", form, of=partial(best_within, minutes=m)) for m in MINUTES),
-        Column("train s in all", ".3g", of=TRAIN.of),
-    ]  # fmt: skip
-    note = (
-        "Validation rows; seconds of learning with preparation, without validation. Methods that train "
-        "in one piece have no curve: their test figure counts from the end of their training."
-    )
-    known = (run.row for run in runs if len(curve(run)[0]))
-    return Table.of("Accuracy against training time", columns, known, note)
-
-
-def validation_figure(run: Run) -> str:
-    """Return the figure of a learning curve: of channels and powers the mean squared error."""
-    return "psnr_db" if run.row["kind"] == "spectrum" else "mse"
-
-
-def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds (n,) and validation figures (n,); one point for a method that trains in one piece."""
-    figure = validation_figure(run)
-    values = run.curve.get(f"val/{figure}")
-    if values is not None and np.isfinite(values).any():
-        # Of steps without a look at validation rows the figure is empty.
-        known = np.isfinite(values)
-        return run.curve["seconds"][known], values[known]
-    end, value = run.row["train_s"], run.row.get(figure)
-    if end is None or value is None:
-        return np.zeros(0), np.zeros(0)
-    return np.array([end]), np.array([value])
 
 
 def effects(runs: Sequence[Run]) -> Table:

@@ -47,7 +47,7 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
     table = tables.results(find_runs(three))
     row = cells(table, 0)
     assert row["PSNR dB"].value == 28.0 and row["PSNR dB"].low < 28.0 < row["PSNR dB"].high
-    assert row["train s"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
+    assert row["train s/fold"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
     assert row["Gaussians"] == 500 and row["effects"] == "none" and row["data"] == "d" * 8
     assert row["commit"] == "c" * 8 and row["s simulated"] is None
     assert cells(table, 2)["points measured"] == 60
@@ -75,26 +75,6 @@ def test_an_interval_of_a_ratio_weighs_samples(three):
     low, high = bootstrap(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
     assert low == high == pytest.approx(0.1)
     assert interval(find_runs(three)[0].row, "no_such_figure") is None
-
-
-def test_best_within_minutes(three):
-    runs = find_runs(three)
-    table = tables.within_minutes(runs)
-    first, last = cells(table, 0), cells(table, 2)
-    assert first["PSNR dB within 1 min"] == 27.0  # the curve ends at 28 - 1
-    assert last["PSNR dB within 1 min"] is None and last["PSNR dB within 5 min"] == 29.5  # 130 s in one piece
-
-
-def test_of_channels_the_least_error_is_the_best_reached(tmp_path):
-    """The largest was: a mean squared error was taken for a figure of which more are better."""
-    facts = {"dataset/kind": "csi", "model/name": "splat", "time/train_s": 200.0}
-    falling = {"seconds": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.2, 0.1])}
-    slower = {"seconds": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.7, 0.5])}
-    runs = [Run(tmp_path, {**facts, "seed": i}, curve=c) for i, c in enumerate((falling, slower))]
-    table = tables.within_minutes(runs)
-    first, second = cells(table, 0), cells(table, 1)
-    assert [first[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.2, 0.1]
-    assert [second[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.7, 0.5]
 
 
 def test_effects_are_paired_by_sample_and_seed(three):
