@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 
 from gsparc.data.own import from_arrays
-from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Values, given
 from gsparc.processes.prior import Prior
@@ -22,7 +21,6 @@ NOISE_DB = 1.0
 STATION = (1_400.0, 1_600.0, 25.0)
 HEIGHT_M = 1.5  # of what moves
 TESTED = 2_000
-SCATTERERS, ANTENNAS, TONES = 10, 16, 64  # of the hall; antennas in a row, half a wavelength apart
 CITY = Path(__file__).parents[2] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
 STATION_USED, JITTER_M, CITY_NOISE_DB = 11, 15.0, 3.0  # the station most heard of; noise as gp finds it
 
@@ -76,34 +74,3 @@ def city(count: int) -> Measurements:
     decibels += CITY_NOISE_DB * rng.standard_normal(len(places))
     arrays = {"tx_position": places, "rx_position": station, "rssi_db": decibels}
     return from_arrays(arrays, {"name": "city"})
-
-
-def hall(path: Path, count: int) -> None:
-    """Write channels of places in a hall of 10 m by 10 m, of which the last `TESTED` are for the test.
-
-    A direct wave and `SCATTERERS` others at 3.5 GHz and 100 MHz, noise of a thousandth of their power.
-
-    Args:
-        path: *.h5, written block by block.
-        count: rows to learn from.
-    """
-    world, rng = np.random.default_rng(3), np.random.default_rng([0, count])
-    sources = np.concatenate([[[12.0, 5.0, 3.0]], world.uniform([-8, -8, 0], [18, 18, 5], (SCATTERERS, 3))])
-    gain = np.concatenate([[1.0], 0.3 * world.normal(size=SCATTERERS)])
-    places = np.c_[rng.uniform(0, 10, (count + TESTED, 2)), np.full(count + TESTED, 1.5)]
-    frequency = 3.5e9 + 1e8 * (np.arange(TONES) / TONES - 0.5)
-    apart = np.arange(ANTENNAS) * 0.5 * LIGHT / 3.5e9
-    with h5py.File(path, "w") as file:
-        file["rx_position"], file["tx_position"] = places, sources[0]
-        file["frequency_hz"], file["carrier_hz"] = frequency, 3.5e9
-        stored = file.create_dataset("csi", (len(places), ANTENNAS, TONES), np.complex64)
-        for start in range(0, len(places), 2_000):
-            towards = sources - places[start : start + 2_000, None]
-            far = np.linalg.norm(towards, axis=2)
-            steer = np.exp(2j * np.pi * 3.5e9 / LIGHT * (towards[..., :1] / far[..., None]) * apart)
-            turn = np.exp(-2j * np.pi / LIGHT * far[..., None] * frequency)
-            clean = np.einsum("npa,npk->nak", (gain / far)[..., None] * steer, turn, optimize=True)
-            noise = rng.standard_normal((2, *clean.shape), np.float32) * np.float32(
-                np.abs(clean).std() * 0.03
-            )
-            stored[start : start + 2_000] = (clean + noise[0] + 1j * noise[1]).astype(np.complex64)
