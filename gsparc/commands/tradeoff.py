@@ -92,8 +92,8 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     with tracking.opened(config) as loggers:
         tracking.picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.table(loggers, "operating points", heads, lines)
-    sentences = [*tradeoff.irreducible(method), *tradeoff.slope(facts)]
-    finish(run_dir, facts, table(title, ["not beaten"], heads[1:], lines), lines=sentences)
+    sheet = table(title, ["not beaten"], heads[1:], lines)
+    finish(run_dir, facts, sheet, lines=tradeoff.irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.
     for p in best:
         other = tradeoff.beaten_by(p, beside, figure)

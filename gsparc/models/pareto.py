@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,6 @@ class Point:
         closeness_db: how near its answers are to the full model's [dB]; decides which points are kept.
         ms: (n,) wall times of single queries end to end [ms].
         size: Gaussians, sources or stored samples that answer.
-        difference: mean paired difference of the figure per sample to the full model, and its standard error.
     """
 
     label: str
@@ -41,7 +40,6 @@ class Point:
     closeness_db: float
     ms: np.ndarray
     size: int = 0
-    difference: tuple[float | None, float | None] = field(default=(None, None))
 
     def value(self, figure: str) -> float:
         """Return a figure; `ValueError` when these rows do not define it."""
@@ -83,15 +81,3 @@ def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
         if not best or score[i] > score[best[-1]]:
             best.append(i)
     return best
-
-
-def cost_of_halving(latency: Iterable[float], score: Iterable[float]) -> float | None:
-    """Return what each halving of the latency costs along a front, by least squares [score per halving].
-
-    Args:
-        latency, score: of the front's points.
-    """
-    x, y = np.log2(np.array(list(latency))), np.array(list(score))
-    if len(x) < 2 or np.ptp(x) == 0:
-        return None
-    return float(np.polyfit(x, y, 1)[0])

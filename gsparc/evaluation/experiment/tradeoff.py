@@ -19,12 +19,11 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
-from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened
-from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.evaluation.scores import rows_of, score
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Point, Settings, cost_of_halving, worded
+from gsparc.models.pareto import Point, Settings, worded
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
 from gsparc.prediction.predictor import Predictor
@@ -33,8 +32,6 @@ from gsparc.prediction.timing import Call, ClockSettings, interleaved
 log = logging.getLogger(__name__)
 
 CLOSEST_DB = 100.0  # the precision of float32
-LEAST_SPAN = 1.1  # times in latency, below which clocks tell no slope
-PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
 
 
 def sweep(
@@ -54,8 +51,8 @@ def sweep(
     Returns:
         A point per candidate and number of threads, and the times [ms] of `others`.
     """
-    figure, split = DECIDING[data.site.scored], Split("tradeoff", (fold,), "")
-    scored: list[tuple[Scores, float]] = []
+    split = Split("tradeoff", (fold,), "")
+    scored: list[tuple[dict[str, float | None], float]] = []
     whole = None
     places = data.moving[rows_of(fold, eval_on)]
     for number, (_, method) in enumerate(candidates):
@@ -63,7 +60,7 @@ def sweep(
         there = score([recorded], data, split, eval_on)
         answers = torch.cat(recorded.means)
         whole = answers if whole is None else whole
-        scored.append((there, closeness(answers, whole)))
+        scored.append((there.figures(), closeness(answers, whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
@@ -77,10 +74,9 @@ def sweep(
         if isinstance(key, str):
             continue
         index, count = key
-        (settings, method), (scores, close) = candidates[index], scored[index]
+        (settings, method), (figures, close) = candidates[index], scored[index]
         label = f"{worded(settings)}, {count} thread{'s' if count > 1 else ''}"
-        apart = _difference(scores, scored[0][0], figure)
-        points.append(Point(label, settings, count, scores.figures(), close, ms, method.size(), apart))
+        points.append(Point(label, settings, count, figures, close, ms, method.size()))
     return points, {name: times[name] for name in others}
 
 
@@ -107,12 +103,6 @@ def closeness(answers: Tensor, whole: Tensor) -> float:
     # 1e-30: two equal answers, or two of nothing, have no ratio.
     apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
-
-
-def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None, float | None]:
-    differences = paired_differences(scores, full, "full")
-    stem = f"paired/full/{PAIRED.get(figure, figure)}"
-    return differences.get(stem), differences.get(f"{stem}_se")
 
 
 @dataclass(frozen=True)
@@ -197,7 +187,6 @@ def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms:
         {
             "label": p.label, "render_ms_p50": p.p50, "render_ms_p95": p.p95,
             "ratio_to_copy": p.p50 / copy_ms, **p.figures,
-            "difference_to_full": p.difference[0], "difference_se": p.difference[1],
             "closeness_db": p.closeness_db, "front": int(i in pareto), "kept_with_model": int(i in chosen),
             "threads": p.threads, "num_gaussians": p.size,
             **{f"set/{knob}": _cell(value) for knob, value in p.settings.items()},
@@ -214,15 +203,11 @@ def _cell(value: Any) -> Any:
 def facts_of(
     points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
 ) -> dict[str, Any]:
-    """`tradeoff/*`, `front/<number>/*`, `baseline/<name>/*` and the full model's time and accuracy."""
+    """`tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
-    useful = [p for p in best if beaten_by(p, others, figure) is None]  # a slope of points that others beat
-    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
-        "tradeoff/span": best[-1].p50 / best[0].p50,
-        "tradeoff/per_halving": halving if best[-1].p50 > LEAST_SPAN * best[0].p50 else None,
         "tradeoff/figure": figure,
         "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
         "time/copy_ms": copy_ms,
@@ -230,9 +215,6 @@ def facts_of(
         "time/render_ms_p95": full.p95,
         f"test/{figure}": full.value(figure),
     }
-    for number, p in enumerate(best, 1):
-        own = {"render_ms_p50": p.p50, "render_ms_p95": p.p95, "label": p.label, **p.figures}
-        facts |= {f"front/{number}/{name}": value for name, value in own.items()}
     for name, other in others.items():
         facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
     return facts
@@ -240,12 +222,8 @@ def facts_of(
 
 def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of the table of points."""
-    rows = []
-    for p in best:
-        gap, error = p.difference
-        apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
-        rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
-    return ["point", "ms p50", "ms p95", figure, "difference to full"], rows
+    rows = [[p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}"] for p in best]
+    return ["point", "ms p50", "ms p95", figure], rows
 
 
 def irreducible(method: Method) -> list[str]:
@@ -256,14 +234,3 @@ def irreducible(method: Method) -> list[str]:
     if isinstance(method, PerStation):
         why = "one of several stations is asked as it was trained"
     return [f"{method.name}: nothing of it can be reduced, so that there is one point ({why})"]
-
-
-def slope(facts: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on what a halving of the latency costs along the front."""
-    names = ("front", "span", "per_halving", "front_beaten_by_others")
-    count, span, slope, beaten = (facts[f"tradeoff/{name}"] for name in names)
-    rest = f" ({count - beaten} that no baseline beats)" if beaten else ""
-    text = (
-        f"{count} points span {span:.1f} times in latency; each halving costs {slope or 0:.2g} dB on average"
-    )
-    return [] if slope is None else [f"{text} along the front{rest}"]

@@ -1,15 +1,14 @@
-"""Who is beaten, and what a halving costs."""
+"""Who is beaten, in words and drawn."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gsparc.evaluation.drawing import look
 from gsparc.evaluation.experiment.tradeoff import Other, beaten_by, draw_front
-from gsparc.models.pareto import Point, cost_of_halving, front, worded
+from gsparc.models.pareto import Point, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -28,11 +27,6 @@ def test_nobody_on_the_front_is_beaten_and_everybody_else_is(pairs):
         same = any((latency[j], score[j]) == (latency[i], score[i]) for j in kept)
         assert (i in kept) == (not beaten and (i in kept)) and (beaten or same)
     assert [latency[i] for i in kept] == sorted(latency[i] for i in kept)
-
-
-def test_a_halving_costs_the_slope_of_the_front():
-    assert cost_of_halving([1, 2, 4, 8], [20, 21, 22, 23]) == pytest.approx(1.0)
-    assert cost_of_halving([1], [20]) is None and cost_of_halving([1, 1], [20, 21]) is None
 
 
 def test_settings_are_said_in_words():
