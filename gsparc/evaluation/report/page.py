@@ -63,8 +63,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
-    makers = (tables.results, tables.effects, tables.worst)
-    study.tables += [table for table in (make(runs) for make in makers) if table.rows]
+    study.tables += [table for table in (tables.results(runs), tables.worst(runs)) if table.rows]
     study.figures = [plots.pareto(runs, fronts), plots.accuracy_cdf(runs)]
     study.plots = [
         (str(figure.get_label()), _unique_ids(plots.svg(figure), number))

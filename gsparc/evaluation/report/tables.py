@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of
-from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.table import Column, Interval, Table, interval, over_seeds
+from gsparc.evaluation.report.runs import Run
+from gsparc.evaluation.report.table import Column, Table, interval, over_seeds
 from gsparc.evaluation.summary import TRAIN_S
 
 WORST = 3
@@ -125,40 +123,3 @@ def worst(runs: Sequence[Run]) -> Table:
             rows.append([*head, float(own[name][i]), there, float(own["confidence"][i])])
     note = "The moving end's position; the Gaussian process there shows whether it is hard for all."
     return Table("The three worst receivers", columns, rows, note)
-
-
-def effects(runs: Sequence[Run]) -> Table:
-    """Gain and cost of each effect: paired differences between runs of one split."""
-    name = PER_SAMPLE[runs[0].row["kind"]]
-    columns = [
-        Column("effect"), Column("without"), Column("with"), Column(f"{heading_of(name)} gained", "+.2f"),
-        Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
-    ]  # fmt: skip
-    rows = []
-    # Every ordered pair: most differ by more than an effect and are passed over.
-    for off, on in product(runs, runs):
-        if _differ_by_effect(off, on):
-            costs = [[column.value(run.row) for run in (off, on)] for column in (TRAIN, P50)]
-            spent = [None if a is None or b is None else b - a for a, b in costs]
-            rows.append([on.row["effects"], off.setting, on.setting, _paired(off, on, name), *spent])
-    note = "Differences per test sample, mean and 95 % interval; same seed, same split."
-    return Table("Effects: gain and cost", columns, rows, note)
-
-
-def _differ_by_effect(off: Run, on: Run) -> bool:
-    names = ("dataset/sha256", "split/sha256", "seed", "model/name")
-    # One split and seed: differences of samples are then paired.
-    same = all(off.facts.get(name) == on.facts.get(name) for name in names)
-    return same and off.row["effects"] == "none" != on.row["effects"]
-
-
-def _paired(off: Run, on: Run, name: str) -> Interval | None:
-    """Mean difference per sample in dB, larger is better."""
-    if name not in off.samples or name not in on.samples or len(off.samples[name]) != len(on.samples[name]):
-        return None
-    gap = (-1 if name == "error_db" else 1) * (sizes(on, name) - sizes(off, name))
-    # Rows that one of both cannot score are in neither mean.
-    gap = gap[np.isfinite(gap)]
-    # 1.96 is the normal quantile of 97.5 %; samples taken as independent.
-    half = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap)) if len(gap) > 1 else math.nan
-    return Interval(float(gap.mean()), float(gap.mean()) - half, float(gap.mean()) + half)

@@ -77,14 +77,6 @@ def test_an_interval_of_a_ratio_weighs_samples(three):
     assert interval(find_runs(three)[0].row, "no_such_figure") is None
 
 
-def test_effects_are_paired_by_sample_and_seed(three):
-    table = tables.effects(find_runs(three))
-    row = cells(table, 0)
-    assert len(table.rows) == 1 and row["effect"] == "array" and row["train s more"] == 120
-    assert row["PSNR dB gained"].value == pytest.approx(1.5) and row["query ms more"] == pytest.approx(-0.3)
-    assert not tables.effects(find_runs(three[:2])).rows
-
-
 def test_the_worst_receivers_are_the_worst(three):
     runs = find_runs(three[:1])
     table = tables.worst(runs)
