@@ -190,6 +190,10 @@ def _foreign(
     if same and known:
         return None, 0, None
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
+    unplaced = [one for one in (data.site, stored[0].site) if one.georeference is None]
+    if not same and len(unplaced) == 1:
+        what += f"; metres of {unplaced[0].name} are about an unknown origin, the others' about degrees"
+        return f"{what}: whether these test rows lie where it was TRAINED cannot be told", None, None
     trained = _trained(stored, data)
     if trained is None:
         what = "rows that it does not name" if same and known is None else what

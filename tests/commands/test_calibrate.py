@@ -89,6 +89,7 @@ def test_too_few_to_test_promise_nothing() -> None:
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
+    run.stored = [SimpleNamespace(extra={})]
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
     monkeypatch.setattr(command, "rows_of", lambda *_: None)
     for name in ("known_positions", "position_kernel", "keep"):
@@ -96,6 +97,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     monkeypatch.setattr(command.confidence, "gather", lambda *_: evidence)
     how = "auto", False, 0
     stored, said = command.store("", {}, {}, Guarantee(-40.0), *how)
+    assert f"confidence={stored.kind}, before: the model's own; " in said  # it changed without a word
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0 and "accepted from" in command.store("", {}, {}, Guarantee(better), *how)[1]

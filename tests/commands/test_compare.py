@@ -35,13 +35,13 @@ def compare(tmp_path, *more: str) -> tuple[int, str]:
 def test_cells_are_filled_once_and_reported_again(tmp_path):
     spectra(tmp_path / "own.npz")
     only = "only=[own/random/mean/*,own/random/nearest/*,own/random/swiftwrf/*]"
-    status, said = compare(tmp_path, only)
+    status, said = compare(tmp_path, only, "figures=[svg]")
     assert status == 0, said
     assert "3 cells, 0 already done" in said and len(FILLED.findall(said)) == 3
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["own/random/0.3/first"] in ("nearest", "mean", "swiftwrf")
     assert summary["own/random/0.3/swiftwrf/query_ms_p50"] > 0
-    for file in ("compare.csv", "compare.md", "compare.png"):
+    for file in ("compare.csv", "compare.md", "compare.png", "compare.svg"):
         assert (tmp_path / "run" / file).exists()
     assert "3 cells, 3 already done" in compare(tmp_path, only, "latency=false")[1]
     again = json.loads((tmp_path / "run" / "summary.json").read_text())

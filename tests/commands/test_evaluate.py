@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import towns
 import yaml
-from campaigns import channels
+from campaigns import channels, powers
 from doors import assert_refused, knock
 
+import gsparc
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
 from gsparc.evaluation.summary import remarks
@@ -38,6 +39,21 @@ def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
     assert {"per_sample.csv", "split.json"} <= {path.name for path in (tmp_path / "run").iterdir()}
     table = "\n".join(done.out)
     assert all(word in table for word in ("query", "nearest", "complex_gp"))
+
+
+def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path):
+    file = powers(tmp_path / "own.npz")
+    given = [f"dataset.file={file}", "dataset=own", "split=none", "model=idw", "threads=1"]
+    done = knock(COMMANDS["train"].run, "train", [*given, f"hydra.run.dir={tmp_path / 'run'}"])
+    assert done.status == 0, done
+    facts = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (facts["split/train"] + facts["split/val"], facts["split/test"]) == (80, 0)
+    assert facts["time/train_s"] > 0 and not any(name.startswith(("test/", "baseline/")) for name in facts)
+    assert "nothing was tested: all 80 rows were learned from (split=none)" in "\n".join(done.out)
+    own = {"name": "own", "file": str(file)}
+    found, _, _ = evaluate_files([tmp_path / "run" / "model.ckpt"], own, eval_on="val")
+    assert found.facts["val/rmse_db"] < 1  # an interpolator of rows that it has learned
+    assert np.isfinite(gsparc.load(tmp_path / "run" / "model.ckpt").rssi(rx=[1.0, 1.0, 1.0]))
 
 
 def test_the_traceback_comes_when_asked_for(tmp_path, monkeypatch):

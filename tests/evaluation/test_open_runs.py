@@ -6,12 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables.read import understand_table
 from gsparc.evaluation.baselines import baseline
-from gsparc.evaluation.open_runs import Opened, aligned
+from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import score
 from gsparc.models.per_station import for_stations
 from gsparc.models.registry import method_class
@@ -89,6 +90,17 @@ def test_degrees_about_another_origin_were_taken_for_the_same_metres():
     same = aligned(part, whole.site)
     np.testing.assert_allclose(same.rx_position, whole.rx_position[50:], atol=1e-3)
     assert same.site.georeference == whole.site.georeference
+
+
+def test_places_in_degrees_were_said_to_be_apart_from_a_model_s_of_an_unknown_origin(tmp_path):
+    """`0 of these 80 test rows are at places that were TRAINED on`, of the very same places."""
+    place, level = WALK, np.linspace(-90, -50, 80)
+    gsparc.fit(rx=place, rssi=level, model="mean", save=tmp_path / "model.ckpt")
+    degrees = {"latitude": 48 + place[:, 1] / 111_000, "longitude": 2 + place[:, 0] / 74_000}
+    np.savez(tmp_path / "drive.npz", **degrees, rx_height=np.array(1.5), rssi_db=level)
+    own = {"name": "own", "file": str(tmp_path / "drive.npz")}
+    run = open_files([tmp_path / "model.ckpt"], own, {"name": "random"})
+    assert run.learned is None and "about an unknown origin" in run.foreign
 
 
 def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():

@@ -15,7 +15,7 @@ from PIL import Image
 
 from gsparc.commands.train import main
 from gsparc.field.optimizer import OptimizerSettings
-from gsparc.training.tracking import Part, picture, table, tensorboard_logger
+from gsparc.training.tracking import Part, picture, table, tensorboard_logger, wandb_logger
 
 COUNTS = {0: 40, 1: 30}  # of Gaussians, in the jobs of the sweep
 
@@ -91,6 +91,15 @@ def sweep(tmp_path_factory) -> list[Path]:
     ]
     assert knock(main, "train.py", ["-m", *words]).status == 0
     return sorted(file.parent for file in (folder / "swept").glob("*/summary.json"))
+
+
+@pytest.mark.parametrize("offline", [None, True, False])
+def test_the_environment_s_mode_of_wandb_was_overridden_by_the_configuration(offline, monkeypatch):
+    said = {}
+    monkeypatch.setattr("lightning.pytorch.loggers.WandbLogger", lambda **settings: said.update(settings))
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    wandb_logger(offline)
+    assert said["mode"] == "disabled" and not said["offline"]
 
 
 def rises(steps) -> bool:

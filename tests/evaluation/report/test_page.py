@@ -24,7 +24,8 @@ FETCHED = re.compile(
 @pytest.fixture(scope="module")
 def written(three_for_all, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    config = compose(*arguments([str(path) for path in three_for_all]), config="report")
+    words = [*arguments([str(path) for path in three_for_all]), "figures=[pdf]"]
+    config = compose(*words, config="report")
     with pytest.MonkeyPatch.context() as patch:
         runs_in(patch, out)
         return task(config), out
@@ -38,6 +39,7 @@ def test_it_writes_a_page_markdown_and_a_csv_file_per_table(written):
     assert {"toy-split-random-results", "toy-split-random-settings-over-seeds"} <= names and len(names) >= 3
     assert (out / "report.md").read_text().count("### ") == len(names)
     assert (out / "summary.json").exists()
+    assert len(list(out.glob("*.pdf"))) == 2  # for print
 
 
 def test_the_page_fetches_nothing(written):
@@ -84,10 +86,10 @@ def test_a_busy_machine_is_said_once(three):
 
 def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
     document = tmp_path / "README.md"
-    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    document.write_text(f"before\n{BEGIN}\nstale\n{END}\nafter\n")
     refresh(document, find_runs(three))
     text = document.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert text.startswith("before\n") and text.endswith("after\n") and "stale" not in text
     assert "28.20 [28.00, 28.40]" in text and "| gp |" in text and "a processor, 1 thread(s)" in text
     document.write_text("no marks")
     with pytest.raises(ValueError, match="are needed, in this order"):
