@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import calls
-from gsparc.ops.operators import KERNELS, contiguous, differentiable, fill, kernel
+from gsparc.ops.operators import KERNELS, contiguous, differentiable, register_kernel, run_kernel
 from gsparc.ops.transforms import beyond_kernels
 
 
@@ -80,21 +80,21 @@ def summed(
 def _outputs(fixed: Any, gains: Tensor, steering: Tensor, delays: Tensor) -> Tensor:
     tones, subcarriers = fixed
     out = gains.new_empty(len(gains), steering.shape[1], subcarriers, 2)
-    return fill("channels", gains, out, gains, steering, delays, tones)
+    return run_kernel("channels", gains, out, gains, steering, delays, tones)
 
 
 def _gradients(fixed: Any, slope: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
     out = tuple(part.new_empty(part.shape) for part in inputs)
-    return fill("channels_backward", slope, out, slope, *inputs, fixed[0])
+    return run_kernel("channels_backward", slope, out, slope, *inputs, fixed[0])
 
 
-@kernel("channels", "cpu")
+@register_kernel("channels", "cpu")
 def _channels(out: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]) -> None:
     sizes = (*gains.shape[:2], *out.shape[1:3])
     calls.run("channels", gains, *contiguous((gains, steering, delays)), out, sizes=sizes, numbers=tones)
 
 
-@kernel("channels_backward", "cpu")
+@register_kernel("channels_backward", "cpu")
 def _channels_backward(
     out: Any, slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]
 ) -> None:

@@ -25,9 +25,9 @@ from gsparc.ops.operators import (
     check_memory,
     composite,
     contiguous,
-    kernel,
     make_plan,
     mean_weights,
+    register_kernel,
 )
 from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
@@ -92,7 +92,7 @@ def run_on_plan(
     calls.run(name, means, *view, *inputs, sizes=counts, settings=plan.settings)
 
 
-@kernel("plan", "cuda")
+@register_kernel("plan", "cuda")
 def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, count, n, buffers = gaussians.means, plan.num_poses, plan.num_gaussians, plan.buffers
     # Before anything is allocated: an overflow in 32 bits would write out of bounds.
@@ -141,14 +141,14 @@ def _zero(gradients: Gaussians) -> None:
             gradient.zero_()
 
 
-@kernel("composite", "cuda")
+@register_kernel("composite", "cuda")
 def _composite(out: Any, plan: Plan, gaussians: Gaussians, features: Tensor) -> None:
     rows = _by_gaussian(features, plan.num_poses)
     if plan.num_poses > 0:
         run_on_plan("composite", plan, gaussians, rows, *out, sizes=rows.shape[2:])
 
 
-@kernel("composite_backward", "cuda")
+@register_kernel("composite_backward", "cuda")
 def _composite_backward(
     out: Any,
     plan: Plan,
@@ -175,7 +175,7 @@ def _composite_backward(
     return grads, grad_rows, grad_means2d
 
 
-@kernel("weights", "cuda")
+@register_kernel("weights", "cuda")
 def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> Any:
     # The kernel writes both sums side by side.
     sums = out[0].new_empty(*out[0].shape, 2)
@@ -184,7 +184,7 @@ def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> Any:
     return sums[..., 0].clone(), sums[..., 1].clone()
 
 
-@kernel("weights_backward", "cuda")
+@register_kernel("weights_backward", "cuda")
 def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tensor) -> None:
     check_memory(capacity_of(plan), out.means.element_size() * (_native.MOMENTS + 1))
     if slopes[0].numel() > 0:

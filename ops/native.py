@@ -17,9 +17,9 @@ from gsparc.ops.operators import (
     check_memory,
     composite,
     contiguous,
-    kernel,
     make_plan,
     mean_weights,
+    register_kernel,
     strips,
 )
 from gsparc.ops.results import Plan
@@ -39,7 +39,7 @@ def run_on_plan(
     return calls.run(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
 
 
-@kernel("plan", "cpu")
+@register_kernel("plan", "cpu")
 def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, pose = gaussians.means, plan.pose
     call = partial(calls.run, sizes=(plan.num_poses, len(means)), settings=plan.settings)
@@ -83,12 +83,12 @@ def rasterize(
     return image, transmittance, radii, visible, means2d
 
 
-@kernel("composite", "cpu")
+@register_kernel("composite", "cpu")
 def _composite(out: Any, plan: Plan, gaussians: Gaussians, features: Tensor) -> None:
     run_on_plan("composite", plan, gaussians, features, *out, sizes=features.shape[::2])
 
 
-@kernel("composite_backward", "cpu")
+@register_kernel("composite_backward", "cpu")
 def _composite_backward(
     out: Any,
     plan: Plan,
@@ -108,12 +108,12 @@ def _composite_backward(
     run_on_plan("composite_backward", plan, gaussians, *tensors, sizes=(samples, channels))
 
 
-@kernel("weights", "cpu")
+@register_kernel("weights", "cpu")
 def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> None:
     run_on_plan("weights", plan, gaussians, *out)
 
 
-@kernel("weights_backward", "cpu")
+@register_kernel("weights_backward", "cpu")
 def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tensor) -> None:
     check_memory(len(plan.buffers.entries), out.means.element_size() * _native.MOMENTS)
     run_on_plan("weights_backward", plan, gaussians, *slopes, *out)

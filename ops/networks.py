@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import backends, calls
-from gsparc.ops.operators import contiguous, differentiable, empty_like, fill, kernel
+from gsparc.ops.operators import contiguous, differentiable, empty_like, register_kernel, run_kernel
 from gsparc.ops.transforms import beyond_kernels, full_precision
 
 
@@ -66,21 +66,21 @@ class Layers(NamedTuple):
 def _outputs(_: None, encoded: Tensor, *weights: Tensor) -> Tensor:
     layers = Layers(*weights)
     out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
-    return fill("networks", encoded, out, encoded, layers)
+    return run_kernel("networks", encoded, out, encoded, layers)
 
 
 def _gradients(_: None, slope: Tensor, encoded: Tensor, *weights: Tensor) -> tuple[Tensor | None, ...]:
     layers = Layers(*weights)
-    return None, *fill("networks_backward", encoded, empty_like(layers), slope, encoded, layers)
+    return None, *run_kernel("networks_backward", encoded, empty_like(layers), slope, encoded, layers)
 
 
-@kernel("networks", "cpu", "cuda")
+@register_kernel("networks", "cpu", "cuda")
 def _networks(out: Tensor, encoded: Tensor, layers: Layers) -> None:
     if out.numel():
         calls.run("networks", encoded, *contiguous((encoded, *layers)), out, sizes=_sizes(encoded, layers))
 
 
-@kernel("networks_backward", "cpu", "cuda")
+@register_kernel("networks_backward", "cpu", "cuda")
 def _networks_backward(out: Layers, slope: Tensor, encoded: Tensor, layers: Layers) -> None:
     if slope.numel():
         tensors = (*contiguous((encoded, *layers, slope)), *out)

@@ -49,11 +49,11 @@ class Buffers(NamedTuple):
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
+def register_kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
     """Mark what computes operator `name` on types of device.
 
-    It receives the operator's empty outputs, then its arguments, as `fill` does. It fills the outputs, or
-    returns others in their place.
+    It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the outputs, or returns
+    others in their place.
     """
 
     def mark(function: _Function) -> _Function:
@@ -64,7 +64,7 @@ def kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
     return mark
 
 
-def fill(name: str, like: Tensor, out: Any, *values: Any) -> Any:
+def run_kernel(name: str, like: Tensor, out: Any, *values: Any) -> Any:
     """Fill the empty outputs `out` of operator `name` on the device of `like`, given its arguments."""
     if like.is_meta:
         return out  # shapes alone
@@ -157,14 +157,14 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         visible=means.new_empty(poses, n, dtype=torch.bool),
         buffers=buffers,
     )
-    return fill("plan", means, empty, gaussians, ids)
+    return run_kernel("plan", means, empty, gaussians, ids)
 
 
 def _composite(plan: Plan, means2d: Tensor, features: Tensor, *parts: Tensor) -> tuple[Tensor, Tensor]:
     samples, _, channels = features.shape
     size = plan.grid.height, plan.grid.width
     out = features.new_empty(samples, channels, *size), features.new_empty(plan.num_poses, *size)
-    return fill("composite", features, out, plan, Gaussians(*parts), features)
+    return run_kernel("composite", features, out, plan, Gaussians(*parts), features)
 
 
 def composite_gradient(
@@ -182,7 +182,9 @@ def composite_gradient(
     gaussians, slope = Gaussians(*parts), torch.zeros_like(image) if grad_image is None else grad_image
     out = empty_like(gaussians), features.new_empty(features.shape), means2d.new_empty(means2d.shape)
     values = slope, grad_transmittance, image, transmittance, features
-    grads, grad_features, grad_means2d = fill("composite_backward", image, out, plan, gaussians, *values)
+    grads, grad_features, grad_means2d = run_kernel(
+        "composite_backward", image, out, plan, gaussians, *values
+    )
     return grad_means2d, grad_features, *grads
 
 
@@ -195,7 +197,7 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
 def _weights(plan: Plan, *parts: Tensor) -> tuple[Tensor, Tensor]:
     gaussians, size = Gaussians(*parts), (plan.num_poses, plan.num_gaussians)
     out = gaussians.means.new_empty(size), gaussians.means.new_empty(size)
-    return fill("weights", gaussians.means, out, plan, gaussians)
+    return run_kernel("weights", gaussians.means, out, plan, gaussians)
 
 
 def _weights_gradient(
@@ -204,7 +206,7 @@ def _weights_gradient(
     gaussians, size = Gaussians(*parts), (plan.num_poses, plan.num_gaussians)
     # The kernel reads both slopes: one that nothing depends on is 0.
     slopes = [gaussians.means.new_zeros(size) if s is None else s for s in (grad_seen, grad_total)]
-    return fill("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
+    return run_kernel("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import calls
-from gsparc.ops.operators import fill, kernel
+from gsparc.ops.operators import register_kernel, run_kernel
 from gsparc.ops.transforms import beyond_kernels
 
 
@@ -30,10 +30,10 @@ def similarity_op(
     A GPU takes no window that is not symmetric or too wide (ValueError).
     """
     out = prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)
-    return fill("similarity", prediction, out, prediction, target, taps, stability, slope)
+    return run_kernel("similarity", prediction, out, prediction, target, taps, stability, slope)
 
 
-@kernel("similarity", "cpu")
+@register_kernel("similarity", "cpu")
 def _cpu(
     out: tuple[Tensor, Tensor],
     prediction: Tensor,
@@ -49,7 +49,7 @@ def _cpu(
     calls.run("similarity", prediction, *tensors, sizes=sizes, numbers=stability)
 
 
-@kernel("similarity", "cuda")
+@register_kernel("similarity", "cuda")
 def _cuda(
     out: tuple[Tensor, Tensor],
     prediction: Tensor,

@@ -14,8 +14,8 @@ from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.report.page import refresh, studies, write
-from gsparc.evaluation.report.runs import columns, find_runs, retime
-from gsparc.evaluation.summary import program, provenance, write_summary
+from gsparc.evaluation.report.runs import find_runs, read_columns, retime
+from gsparc.evaluation.summary import program_version, provenance, write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     out = run_directory()
     sections = studies(runs, _fronts(paths))
     origin = provenance()
-    note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
+    note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program_version(origin)}"
     write(out, config.title, note, sections, config.figures)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
     for run in runs:
@@ -54,4 +54,4 @@ def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
     # Sorted, as the order of a file system differs from machine to machine.
     files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
     texts = ((file.parent / "summary.json").read_text(encoding="utf-8") for file in files)
-    return [(str(json.loads(t)["dataset/name"]), columns(f)) for t, f in zip(texts, files, strict=True)]
+    return [(str(json.loads(t)["dataset/name"]), read_columns(f)) for t, f in zip(texts, files, strict=True)]

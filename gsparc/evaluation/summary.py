@@ -77,7 +77,7 @@ def provenance() -> dict[str, str | None]:
     return {"git": _git(), "versions": _versions()}
 
 
-def program(origin: Mapping[str, str | None]) -> str:
+def program_version(origin: Mapping[str, str | None]) -> str:
     """`gsparc 0.1.0`, and the commit of `provenance()` where there is a source tree."""
     commit = origin["git"]
     return f"gsparc {version('gsparc')}" + (f" at commit {commit[:8]}" if commit else "")

@@ -261,7 +261,7 @@ class Trial:
         }  # fmt: skip
 
 
-def divided(
+def split_evidence(
     evidence: Evidence, how: How, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
@@ -332,7 +332,7 @@ def accept(
         ValueError: `kind` is no confidence of this evidence.
     """
     rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
+    choose_on, calibrate, test = split_evidence(evidence, "spatial" if spatial else "random", rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")

@@ -14,7 +14,7 @@ from rich.console import Console
 
 import gsparc.evaluation.summary
 from gsparc.evaluation.summary import (
-    program,
+    program_version,
     provenance,
     remarks,
     results_table,
@@ -99,5 +99,5 @@ def test_rows_that_were_learned_from_were_shown_like_unseen_ones(prefix):
 
 
 def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
-    assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program({"git": None}))
-    assert program({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")
+    assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program_version({"git": None}))
+    assert program_version({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")

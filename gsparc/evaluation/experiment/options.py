@@ -33,7 +33,7 @@ STEPS = "no gradient steps are asked for: say model.steps=auto"
 NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is done
 
 
-def given() -> dict[str, str]:
+def command_line_options() -> dict[str, str]:
     """Return what the command line says: words by dotted names of settings."""
     if not HydraConfig.initialized():
         return {}
@@ -49,9 +49,9 @@ def given() -> dict[str, str]:
 
 
 def noting(config: DictConfig, method: MethodFactory) -> Reads:
-    """Return what is to be noted of the options that were `given` to what `config.model` describes."""
+    """Return what is to be noted of the options of the command line, for what `config.model` describes."""
     options = []
-    for path in given():
+    for path in command_line_options():
         group, _, name = path.rpartition(".")
         node = OmegaConf.select(config, group) if group else None
         if isinstance(node, DictConfig) and name in node and (name not in NAMES or path == "init.name"):
@@ -88,7 +88,7 @@ def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     reads.noted |= {name for name, heeded in counted.items() if heeded}
     known = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)
-    for path, text in given().items():
+    for path, text in command_line_options().items():
         # Prefixes end at a dot, else `trainer` would count `trainer_x`.
         judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
         if judged and not reads.heeds(path):

@@ -23,7 +23,7 @@ from gsparc.evaluation.results import under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
-from gsparc.models.refined_places import displaced as elsewhere
+from gsparc.models.refined_places import displaced
 from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
 from gsparc.training.context import FitContext
 
@@ -74,17 +74,19 @@ class Condition:
         if self.what == "keep":
             return data, thinned(fold, self.amount, seed)
         if self.what == "directions":
-            return turned(data, self.amount, seed), fold
+            return with_direction_errors(data, self.amount, seed), fold
         if self.what not in ("train", "train_known"):
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
-        moved = displaced(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
+        moved = with_position_errors(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
     def tested_on(self, data: Measurements, split: Split, seed: int) -> Measurements:
         """Data whose test rows are asked about."""
-        return displaced(data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed)
+        return with_position_errors(
+            data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed
+        )
 
 
 ROW = (
@@ -298,7 +300,7 @@ class Measured:
         return [Condition("keep", float(keep)) for keep in self.keep]
 
 
-def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
+def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
     """Move where the end of `rows` is believed by N(0, error_m^2) per coordinate; all else stays the same.
 
     Rows of one place, heard by several stations, are believed to be at one place.
@@ -306,10 +308,10 @@ def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -
     # One error a place, or averages over rows of one place would shrink it.
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
-    return elsewhere(data, rows, offset[first][place.reshape(-1)])
+    return displaced(data, rows, offset[first][place.reshape(-1)])
 
 
-def turned(
+def with_direction_errors(
     data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
 ) -> Measurements:
     """Directions of arrival as a receiver measures them; all else the same.

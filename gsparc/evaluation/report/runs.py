@@ -157,8 +157,8 @@ def read_run(folder: Path) -> Run:
     Raises:
         ValueError: its files are of two runs.
     """
-    render = columns(folder / "render_ms.csv").get("render_ms")
-    facts, samples = _facts(folder / SUMMARY), columns(folder / "per_sample.csv")
+    render = read_columns(folder / "render_ms.csv").get("render_ms")
+    facts, samples = _facts(folder / SUMMARY), read_columns(folder / "per_sample.csv")
     # A folder used twice, the second run killed, holds files of both.
     runs = {facts.get("run_id"), *samples.pop("run_id", np.zeros(0))[:1].tolist()}
     runs |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
@@ -174,7 +174,7 @@ def read_run(folder: Path) -> Run:
     )
 
 
-def columns(path: Path) -> dict[str, np.ndarray]:
+def read_columns(path: Path) -> dict[str, np.ndarray]:
     """Return a CSV file by column: numbers float64 (NaN where empty), else text; {} without file or rows."""
     if not path.is_file():
         return {}

@@ -76,7 +76,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     if settings.retime:
         runs = retime(runs, rounds=settings.rounds, budget_s=settings.budget_s)
     origin = summary.provenance()
-    write(folder, title, f"{len(runs)} runs; made by {summary.program(origin)}", studies(runs))
+    write(folder, title, f"{len(runs)} runs; made by {summary.program_version(origin)}", studies(runs))
     facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
     for number, (study, together) in enumerate(by_study(runs).items()):
         group = distinct_overrides(together)

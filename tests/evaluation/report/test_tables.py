@@ -9,7 +9,7 @@ import pytest
 
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.plots import short
-from gsparc.evaluation.report.runs import Run, columns, distinct_overrides, find_runs
+from gsparc.evaluation.report.runs import Run, distinct_overrides, find_runs, read_columns
 from gsparc.evaluation.report.table import Column, Interval, Table, bootstrap, interval
 
 
@@ -97,9 +97,9 @@ def test_a_table_survives_csv_and_markdown():
 
 def test_columns_keep_text_as_text(tmp_path):
     (tmp_path / "x.csv").write_text("a,b\n1,x\n,y\n")
-    found = columns(tmp_path / "x.csv")
+    found = read_columns(tmp_path / "x.csv")
     assert np.isnan(found["a"][1]) and found["b"].tolist() == ["x", "y"]
-    assert columns(tmp_path / "none.csv") == {}
+    assert read_columns(tmp_path / "none.csv") == {}
 
 
 def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
