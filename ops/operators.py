@@ -52,8 +52,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def register_kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
     """Mark what computes operator `name` on types of device.
 
-    It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the outputs, or returns
-    others in their place.
+    It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the outputs, or
+    returns others in their place.
     """
 
     def mark(function: _Function) -> _Function:
