@@ -73,7 +73,7 @@ COMMANDS = {
         Command("plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"),
         Command("place", "where one more station serves an area best: ckpt=FILE"),
         Command("report", "one page about many runs: RUN...", bare="runs"),
-        Command("bench", "timings of kernels as ratios to the machine's limit"),
+        Command("bench", "seconds of kernels beside plain PyTorch"),
     )
 }
 
