@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import to_absolute_path
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import run_directory
 from gsparc.commands.shared.run_lock import locked
@@ -52,19 +52,12 @@ def _effects(config: dict[str, Any]) -> PropagationEffects | AutoSettings:
 
 
 def task(config: DictConfig) -> Outcome | None:
-    """Simulate, then table, summary and pictures.
-
-    `scene=help [out=FILE.png]` lists scenes.
-    """
+    """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
     RunSettings.of(config)
     run_dir, console = run_directory(), open_console()
     if config.scene.name == "help":
-        listed, meshes = simulated.shipped_scenes()
-        console.print(listed)
+        console.print(simulated.shipped_scenes())
         console.print(OTHERS)
-        if not OmegaConf.is_missing(config, "out"):
-            simulated.plans(meshes, Path(to_absolute_path(str(config.out))))
-            console.print(f"plans in {config.out}")
         return None
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
@@ -78,7 +71,6 @@ def task(config: DictConfig) -> Outcome | None:
     if len(triangles):
         write_mesh(triangles, run_dir / "scene.obj")
     if outcome.choice is not None:
-        simulated.effect_shares(outcome.choice, run_dir / "effects.png")
         console.print(choice_table(outcome.choice))
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
