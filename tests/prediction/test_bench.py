@@ -7,7 +7,14 @@ import torch
 from campaigns import compose
 
 from gsparc.commands import bench
+from gsparc.prediction import bench as timed
 from gsparc.prediction.bench import cases, loss, step
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch):
+    """Batches of two: plain PyTorch is slow."""
+    monkeypatch.setattr(timed, "BATCH", 2)
 
 
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])

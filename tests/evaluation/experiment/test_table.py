@@ -75,7 +75,7 @@ def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, mon
     drawn = {"kind": "rssi", "drawn": True}
     found = rows_of([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
     figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     pictures.draw_splits(found, tmp_path / "city.png")
     texts = [[text.get_text() for text in axis.texts] for axis in figures[0].axes]
     assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
