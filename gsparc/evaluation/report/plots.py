@@ -101,6 +101,8 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     """
     names = [name for name in CDFS[runs[0].row["kind"]] if name in runs[0].samples]
     names += [TIMES] if any(len(run.render_ms) for run in runs) else []
+    if not names:  # nothing was tested
+        return
     labels = {}
     for setting, group in grouped(runs).items():
         seconds = np.mean([run.row["train_s"] for run in group])
