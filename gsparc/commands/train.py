@@ -322,7 +322,7 @@ def _draw(
     own = {
         f"final/{name}": value
         for name, value in facts.items()
-        if isinstance(value, (int, float)) and not name.startswith(("baseline/", "paired/"))
+        if isinstance(value, (int, float)) and not name.startswith("baseline/")
     }
     tracking.final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]

@@ -23,7 +23,6 @@ from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, 
 
 log = logging.getLogger(__name__)
 
-REFERENCE = "gp"  # differences are paired with it
 # results.py reads the key render_ms_batch64 by this number.
 BATCH = 64
 SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
@@ -74,7 +73,7 @@ def evaluate(
     Nothing is scored or timed where `split=none` left no test rows.
 
     Returns:
-        `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
+        `test/*`, `baseline/<name>/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
         `dataset/*`, `split/*`.
 
     Raises:
@@ -109,8 +108,6 @@ def evaluate(
     if decided and data.row_names:
         decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
-    if REFERENCE in others:
-        facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
     # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
     if FIELD in every:
@@ -135,27 +132,6 @@ def _about(
         "time/train_total_s": None if seconds is None else float(sum(seconds)),
         **dataset_facts(data), **split_facts(split), **timing.machine_facts(), **timing.peak_memory(),
     }  # fmt: skip
-
-
-def paired_differences(scores: Scores, reference: Scores, name: str) -> dict[str, float | None]:
-    """Mean per-sample differences to `reference` and their standard errors: `paired/<name>/<figure>[_se]`.
-
-    The standard error takes samples as independent; under `grouped` neighbours are not: it is a lower bound.
-
-    Raises:
-        ValueError: the two are of different rows.
-    """
-    if not (np.array_equal(scores.row, reference.row) and np.array_equal(scores.fold, reference.fold)):
-        raise ValueError(f"results cannot be paired with {name}: they are on different rows")
-    facts: dict[str, float | None] = {}
-    own, other = paired_values(scores.samples), paired_values(reference.samples)
-    for figure in own:
-        difference = own[figure] - other[figure]
-        difference = difference[~np.isnan(difference)]
-        n = len(difference)
-        facts[f"paired/{name}/{figure}"] = float(difference.mean()) if n else None
-        facts[f"paired/{name}/{figure}_se"] = float(difference.std(ddof=1) / np.sqrt(n)) if n > 1 else None
-    return facts
 
 
 def latencies(

@@ -8,7 +8,7 @@ import torch
 
 from gsparc.data.own import from_arrays
 from gsparc.evaluation.baselines import BASELINES, baseline
-from gsparc.evaluation.evaluate import evaluate, paired_differences
+from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import decided_by_a_row, result_rows, write_samples, write_summary
 from gsparc.models.baselines.idw import InverseDistance
@@ -46,7 +46,7 @@ def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
     for name in BASELINES:
         assert facts[f"baseline/{name}/train_s"] >= 0 and facts[f"baseline/{name}/render_ms_p50"] > 0
     for key in (
-        "paired/gp/nmse", "paired/gp/nmse_se", "time/train_s", "time/render_ms_p50", "time/render_ms_p95",
+        "time/train_s", "time/render_ms_p50", "time/render_ms_p95",
         "time/render_ms_batch64", "time/ratio_to_copy", "time/includes", "machine/threads", "machine/load",
         "machine/cpu", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
         "dataset/sha256",
@@ -66,8 +66,6 @@ def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
         assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
     assert facts["baseline/nearest/skill"] == 0
     assert facts["test/skill"] == pytest.approx(1 - facts["test/mse"] / facts["baseline/nearest/mse"])
-    for key in ("ssim_gauss", "psnr_db"):
-        assert facts[f"paired/gp/{key}"] == pytest.approx(facts[f"test/{key}"] - facts[f"baseline/gp/{key}"])
 
 
 def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monkeypatch):
@@ -95,18 +93,6 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     assert not any("decided_by" in key for key in facts) and not decided_by_a_row(facts)
     heads, _ = result_rows(facts, "idw")
     assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
-
-
-def test_standard_error_of_paired_differences(campaign, folds, tmp_path):
-    data, split = campaign("csi", 40), folds(40)
-    own, other = (baseline(name, data, split).scores for name in ("idw", "gp"))
-    facts = paired_differences(own, other, "gp")
-    difference = own.samples["snr_db"] - other.samples["snr_db"]
-    assert facts["paired/gp/snr_db"] == pytest.approx(difference.mean())
-    assert facts["paired/gp/snr_db_se"] == pytest.approx(difference.std(ddof=1) / np.sqrt(len(difference)))
-    assert facts["paired/gp/nmse"] == pytest.approx(own.figures()["nmse"] - other.figures()["nmse"])
-    with pytest.raises(ValueError, match="different rows"):
-        paired_differences(own, dataclasses.replace(other, row=other.row + 1), "gp")
 
 
 def test_folds_are_pooled(campaign, folds, tmp_path):
