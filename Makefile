@@ -70,9 +70,9 @@ test: setup ## fast tests (under 6 minutes on two idle cores)
 browser: ## Debian's chromium for the test of the report, where packages can be reached
 	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || (apt-get update -qq && apt-get install -y -qq chromium chromium-driver) >/dev/null 2>&1 || echo "no chromium here: the test of the report in a browser is skipped"
 
-results: setup ## results table of docs/results.md, measured anew (of gsparc data rfid-200, or of RFID=DIR; about five minutes)
+results: setup ## tables of docs/results.md in outputs/results/report, measured anew (of gsparc data rfid-200, or of RFID=DIR; about five minutes)
 	$(RUN) train.py -m experiment=results $(if $(RFID),dataset.root=$(RFID),dataset.listed=160) hydra.sweep.dir=outputs/results
-	$(RUN) -m gsparc report outputs/results readme=docs/results.md
+	$(RUN) -m gsparc report outputs/results hydra.run.dir=outputs/results/report
 
 test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(PYTEST) -m "slow and not rare"

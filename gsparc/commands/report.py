@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.report.page import refresh, studies, write
+from gsparc.evaluation.report.page import studies, write
 from gsparc.evaluation.report.runs import find_runs, read_columns, retime
 from gsparc.evaluation.summary import program_version, provenance, write_summary
 
@@ -42,9 +42,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         facts |= {f"{stem}/{name}": run.row[column] for name, column in own.items()}
     write_summary(out / "summary.json", facts)
     console = open_console()
-    if config.readme:
-        refresh(Path(config.readme), runs)
-        console.print(f"table in {config.readme} written anew", highlight=False)
     console.print(f"{note}; written to {out / 'report.html'}", highlight=False)
     return facts
 

@@ -6,7 +6,7 @@ import base64
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gsparc.data.files import whole_file
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
@@ -135,38 +134,3 @@ def write(
 
 def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
-
-
-BEGIN = "<!-- results: written by `make results` -->"
-END = "<!-- end of results -->"
-OMITTED_COLUMNS = ("SSIM (uniform 7)", "MSE", "p95", "Gaussians")  # columns for the report's page
-OMITTED_ROWS = ("zero",)  # rows likewise
-
-
-def refresh(path: Path, runs: Sequence[Run]) -> None:
-    """Replace what stands between the marks `BEGIN` and `END`; the file is replaced whole.
-
-    Raises:
-        ValueError: the marks are missing or in the wrong order.
-    """
-    text = path.read_text(encoding="utf-8")
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"{path}: the lines {BEGIN} and {END} are needed, in this order")
-    block = "\n".join(_short(f"{name}, split {cut}", group) for (name, cut), group in by_study(runs).items())
-    with whole_file(path) as partial:
-        partial.write_text(f"{before}{BEGIN}\n\n{block}\n{END}{after}", encoding="utf-8")
-
-
-def _short(title: str, runs: Sequence[Run]) -> str:
-    """The settings of a study over seeds, then the baselines."""
-    runs = [replace(run, render_ms=np.zeros(0)) for run in runs]  # on the clock that timed the baselines
-    table, facts = tables.seeds(runs), runs[0].facts
-    plain = [row for row in tables.beside(runs) if row[0] not in OMITTED_ROWS]
-    blank = [None] * (len(table.columns) - len(plain[0])) if plain else ()  # baselines have no seeds
-    rows = [*table.rows, *([name, *blank, *rest] for name, *rest in plain)]
-    load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
-    machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
-    note = f"{machine}, load {load:.1f} per core; queries in turns."
-    return Table(title, table.columns, rows, note).without(*OMITTED_COLUMNS).markdown()

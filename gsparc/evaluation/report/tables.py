@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -69,14 +68,6 @@ def seeds(runs: Sequence[Run]) -> Table:
     ]  # fmt: skip
     columns = [SETTING, *also, Column("seeds", "d"), *spread]
     return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
-
-
-def beside(runs: Sequence[Run]) -> list[list[Any]]:
-    """Rows of the first run's baselines below those of `seeds`, but for what differs and the seeds."""
-    return [
-        [row["setting"], *(over_seeds([column.value(row)]) for column in _spread_columns(runs))]
-        for row in runs[0].baselines
-    ]
 
 
 def _spread_columns(runs: Sequence[Run]) -> list[Column]:

@@ -11,7 +11,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
 from gsparc.evaluation.drawing import look
 from gsparc.evaluation.report import plots
-from gsparc.evaluation.report.page import BEGIN, END, html, refresh, studies, warnings
+from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.runs import find_runs
 
 arguments = COMMANDS["report"].arguments
@@ -82,30 +82,6 @@ def test_a_busy_machine_is_said_once(three):
         run.facts["machine/load"] = load
     said = [text for text in warnings(runs) if "busy" in text]
     assert said == ["the machine was busy (load 0.2 to 3.0 per core): times are inflated, ratios less so"]
-
-
-def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
-    document = tmp_path / "README.md"
-    document.write_text(f"before\n{BEGIN}\nstale\n{END}\nafter\n")
-    refresh(document, find_runs(three))
-    text = document.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "stale" not in text
-    assert "28.20 [28.00, 28.40]" in text and "| gp |" in text and "a processor, 1 thread(s)" in text
-    document.write_text("no marks")
-    with pytest.raises(ValueError, match="are needed, in this order"):
-        refresh(document, find_runs(three))
-    assert document.read_text() == "no marks"
-
-
-def test_a_document_s_table_of_settings_that_differ_in_more_than_was_swept(three, tmp_path):
-    """Rows of baselines were a cell short beside the column that says so: an IndexError."""
-    for number, run in enumerate(three):
-        (run / ".hydra" / "config.yaml").write_text(f"model: {{width: {number // 2}}}")
-    document = tmp_path / "README.md"
-    document.write_text(f"{BEGIN}\n{END}\n")
-    refresh(document, find_runs(three))
-    rows = [line.count("|") for line in document.read_text().splitlines() if line.startswith("|")]
-    assert "differs, too" in document.read_text() and len(set(rows)) == 1
 
 
 @pytest.mark.slow
