@@ -23,6 +23,7 @@ from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
+from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.units import LINEAR, PowerUnit
 
 log = logging.getLogger(__name__)
@@ -96,12 +97,17 @@ def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> 
     return interpret(raw, "arrays").data
 
 
-def interpret(raw: Raw, source: str | Path) -> Reading:
+def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     """Validate `raw` and centre, scale and hash it.
 
     CSI is divided by its root mean square over all measured entries, RSSI by its mean power; spectra of
     floating point are divided by their largest value unless it lies between 0.1 and 1. The constant is
     one per site, rounded to whole decibels, and kept as `site.target_scale`: metrics multiply it back.
+
+    Args:
+        raw: named as in docs/reference/schema.md.
+        source: for messages.
+        part: of the campaign that is used.
 
     Raises:
         DataError: all problems, with array and row.
@@ -110,7 +116,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check.names()
     measured = check.measurement()
     about = _attributes(check, Path(source).stem, measured)
-    links = None if measured is None else expand(check, measured)
+    links = None if measured is None else expand(check, measured, part)
     # Without a measurement no array has a length to be checked against: nothing more can be said.
     if measured is None or links is None:
         check.problems.raise_if_any()
