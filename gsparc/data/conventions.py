@@ -128,25 +128,6 @@ def _without_zeros(signals: Signals) -> Signals:
     return replace(signals, mask=measured if signals.mask is None else measured & signals.mask)
 
 
-def _along(signals: Signals) -> int:
-    """Antennas along the axis of a planar array that runs faster in their list; 0 of other arrays."""
-    if not _antennas(signals):
-        return 0
-    place = np.asarray(signals.array)
-    # Rounded to 1e-4 of the array's side: files print positions of a lattice with few digits.
-    cells = np.round((place - place[0]) / max(float(np.ptp(place, axis=0).max()), 1e-9), 4)
-    sides = [len(np.unique(cells[:, axis])) for axis in range(3)]
-    # A full lattice in a plane: one coordinate is constant, and the sides' product is the count.
-    planar = sorted(sides)[0] == 1 and sorted(sides)[1] > 1 and math.prod(sides) == len(place)
-    return sides[int(np.abs(cells[1]).argmax())] if planar else 0
-
-
-def _other_axis_first(signals: Signals) -> Signals:
-    # The list runs along the other axis than the positions do; these stay as they are.
-    order = np.arange(signals.values.shape[1]).reshape(_along(signals), -1).T.ravel()
-    return signals.moved(lambda values: values[:, order])
-
-
 def _transposed(signals: Signals) -> Signals:
     # Only images without `grid_deg` come here (`_hemisphere`): the grid follows from their shape.
     grid = SphereGrid.hemisphere(*signals.values.shape[:0:-1])
@@ -198,10 +179,6 @@ def _antennas(signals: Signals) -> bool:
     return signals.tones is not None and signals.array is not None
 
 
-def _planar(signals: Signals) -> bool:
-    return _along(signals) > 0
-
-
 UNTRIED = ("swap_iq", "zeros_unmeasured", "decibels")  # as conjugate, or told by other means
 _ROWS: dict[str, tuple[str, Callable[[Signals], Signals], Callable[[Signals], bool]]] = {
     "conjugate": ("conjugated channels, exp(+j 2 pi f d / c)", _values(np.conj), _channel),
@@ -211,7 +188,6 @@ _ROWS: dict[str, tuple[str, Callable[[Signals], Signals], Callable[[Signals], bo
     "fft_order": ("tones in the order of an FFT", _moved(lambda v: np.fft.fftshift(v, axes=2)), _tones),
     "reverse_tones": ("tones from the highest to the lowest", _moved(lambda v: np.flip(v, 2)), _tones),
     "reverse_antennas": ("antennas in reverse order", _moved(lambda v: np.flip(v, 1)), _antennas),
-    "exchange_array": ("antennas along the other axis of the planar array", _other_axis_first, _planar),
     "array_mm": ("array_position in millimetres", _array(lambda _: 1e-3), _antennas),
     "array_wavelengths": ("array_position in wavelengths", _array(lambda s: s.wavelength), _antennas),
     "delays_removed": ("the delay of each row taken out", _with_delays, _tones),

@@ -1,6 +1,6 @@
 """Whether channels and spectra follow the schema's conventions, told by the direct path between known ends.
 
-Each rival of `CONVENTIONS`, and each two of them, is scored as the declared one is. Of channels the share of
+Each rival of `CONVENTIONS` is scored as the declared one is. Of channels the share of
 a row's power along the direct path counts, with a free factor for each row, free phases of the antennas and a
 free delay common to all rows, and whether the factors of rows agree; of spectra how much of the sphere is
 stronger than the direction of the other end. A row counts once, however many entries it has, since
@@ -10,10 +10,8 @@ reflections are common to them, and rows within half a wavelength count as one. 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -31,7 +29,6 @@ COHERENT = 8  # antennas, tones or both with one factor: fewer fit anything
 ANY = {"csi": 0.01, "spectrum": 0.003}  # share that no path explains
 FIT = {"csi": 0.12, "spectrum": 0.8}  # of the median row, at least of a rival; a worse one says nothing
 ONE_DELAY, CLEAR = 0.7, 0.15  # the same of one delay for all rows, and its gain: reflections fit one, too
-GOOD = {"csi": 0.5, "spectrum": 0.95}  # of what is declared: with it no two conventions are tried together
 HALVINGS = 3  # of the places, into groups
 DROPPED = 2  # groups that speak most for a rival: the others must do so, too
 SHARED = 8  # rows with one phase, at least
@@ -127,41 +124,26 @@ def _rivals(signals: Signals, few: Signals, labels: np.ndarray) -> list[str]:
     names = [n for n, one in CONVENTIONS.items() if one.tried and one.applies(few)]
     groups, declared = _groups(place), _score(signals, labels)
     rivals = {}
-    pairs = combinations(names, 2) if declared.fit < GOOD[kind] else ()
-    for chosen in [*((name,) for name in names), *pairs]:
+    for name in names:
         with suppress(ValueError):  # a grid turned beyond a pole
-            rivals[chosen] = _score(mended(signals, chosen), labels)
+            rivals[name] = _score(mended(signals, [name]), labels)
 
-    def may_be(chosen: tuple[str, ...], rival: Score) -> bool:
+    def may_be(name: str, rival: Score) -> bool:
         gain = float((rival.rows - declared.rows).mean())
-        clear = "delays_removed" not in chosen or (rival.fit > ONE_DELAY and gain > CLEAR)
+        clear = name != "delays_removed" or (rival.fit > ONE_DELAY and gain > CLEAR)
         return clear and rival.fit > FIT[kind]
 
-    def wins(rival: Score, over: Score) -> bool:
-        gain = rival.rows - over.rows
-        of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
-        return float(of_group[:-DROPPED].sum()) + (rival.phases - over.phases) / 2 > RATIO
-
-    rivals = {chosen: one for chosen, one in rivals.items() if may_be(chosen, one)}
-    best: tuple[str, ...] = ()
-    for count in (1, 2):
-        fit = {chosen: one.total for chosen, one in rivals.items() if len(chosen) == count}
-        first = max(fit, key=lambda chosen: fit[chosen], default=())
-        if first and wins(rivals[first], rivals[best] if best else declared):
-            best = first
-    if not best:
+    rivals = {name: one for name, one in rivals.items() if may_be(name, one)}
+    best = max(rivals.values(), key=lambda one: one.total, default=declared)
+    gain = best.rows - declared.rows
+    of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
+    if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
-    least = rivals[best].total - RATIO
-    best, *alike = [c for c, one in rivals.items() if len(c) == len(best) and one.total > least]
-    said = " and ".join(CONVENTIONS[name].words for name in best)
-    others = "".join(f" or {_setting(chosen)}" for chosen in alike)
+    named, *alike = [name for name, one in rivals.items() if one.total > best.total - RATIO]
+    others = "".join(f" or dataset.{name}=true" for name in alike)
     others += ", which these rows do not tell apart" if others else ""
-    how = f"{len(signals.values)} rows drawn fit the direct path more than 1,000 times better with {said}"
-    return [f"{how}: is it that? {_setting(best)}{others} mends it"]
-
-
-def _setting(chosen: Iterable[str]) -> str:
-    return " ".join(f"dataset.{name}=true" for name in chosen)
+    how = f"{len(signals.values)} rows drawn fit the direct path more than 1,000 times better with "
+    return [f"{how}{CONVENTIONS[named].words}: is it that? dataset.{named}=true{others} mends it"]
 
 
 def _groups(place: np.ndarray) -> np.ndarray:

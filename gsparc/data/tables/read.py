@@ -25,7 +25,6 @@ from gsparc.data.tables.opening import read_parquet, sheet_of
 from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, StationList, one_each, places, read_stations
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.tables.slots import unfolded
-from gsparc.data.tables.splitting import splitting
 
 NOTHING: Mapping[str, object] = {}
 
@@ -206,8 +205,6 @@ class Builder:
             self.arrays["station_name"] = np.array(stations.names)
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
             others["station"] = stations.places
-        # Warnings need the level and the station of each row, so both are known before.
-        self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
@@ -219,37 +216,19 @@ class Builder:
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
-    def _unused(self) -> dict[str, np.ndarray]:
-        """Text (S,) of the columns that are not used, those of one value left out."""
-        used = {column.head for columns in self.chosen.values() for column in columns}
-        # A column of one value tells nothing apart, whatever it is called.
-        words = {head: self.sheet.words(head) for head in self.sheet.heads if head not in used}
-        return {head: text for head, text in words.items() if (text != text[0]).any()}
-
     def _zones(self, where: Places) -> str:
         """Head of a column that tells two groups of places far apart from each other; empty without."""
         groups = None if where.degrees else two_groups(where.across)
         if groups is None:
             return ""
-        for head, words in self._unused().items():
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        for head in [head for head in self.sheet.heads if head not in used]:
+            words = self.sheet.words(head)
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             # A tenth of the rows: columns with more values number rows or times rather than places.
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
                 return head
         return ""
-
-    def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
-        """Warn of unused columns whose groups have levels or places of their own within one station."""
-        if measured not in LEVELS or self.arrays[measured].ndim > 1:
-            return
-        level = self.arrays[measured]
-        station = np.zeros(len(level), int) if station is None else station
-        # A degree of longitude is shorter than one of latitude, by the cosine of the latitude.
-        stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
-        names = [column.head or "" for column in self.chosen.get("station", ())]
-        for head, said in splitting(where.across * [1, stretch], level, station, self._unused()):
-            how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
-            self.notes.append(Caution(f"{said}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
@@ -300,7 +279,6 @@ class Builder:
             words = plain if exact and set(plain) <= set(listed.names) else words
             self.listed = listed if words is plain else joined
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
-        self._rounded(words, head)
         if self.listed is not None:
             self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
@@ -325,14 +303,6 @@ class Builder:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
-
-    def _rounded(self, words: np.ndarray, head: str) -> None:
-        """Warn of names that a spreadsheet has rounded: several stations may have become one."""
-        # Spreadsheets keep 15 digits of a number: longer ones, like cell identities, then end in zeros.
-        lost = sorted({w for w in words.tolist() if re.fullmatch(r"\d(?:[.,]\d+)?E\+\d+|\d{15}0{2,}", w)})
-        if lost:
-            said = f"column {head!r}: {some(lost, 3)}: rounded by a spreadsheet, stations may have become one"
-            self.notes.append(Caution(f"{said}; export the column as text"))
 
     def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
         """Stations at places that nobody gave."""
