@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, bad_positions, rounded_rms
+from gsparc.data.assemble import bad_positions, centred, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import far_ends, peaks, too_strong
 from gsparc.data.conventions import Signals, mended
@@ -22,7 +22,7 @@ from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.units import LINEAR, PowerUnit
 
@@ -186,18 +186,22 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
     noise = None if noise is None else (noise / scale**2).astype(np.float32)
-    data = assemble(
-        kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
-        target_scale=scale, noise_variance=noise, directions=directions, grid=grid, array=array,
-        carrier_hz=carrier, subcarriers_hz=frequency if kind == "csi" else None,
-        row_names=row_names, release_split=release_split, links=links,
-        position_std=position_std, **about,
+    site = Site(
+        kind=kind, static_end=links.static_end, grid=grid, array=array, carrier_hz=carrier,
+        target_scale=scale, subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
+        georeference=links.georeference, **about,
     )  # fmt: skip
+    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES}
+    data = centred(Measurements(
+        site, tx, rx, rotation, target, mask, noise, directions, row_names, release_split, provenance,
+        station=links.station, place=links.place, censored=links.censored, run=links.run,
+        position_std=position_std,
+    ))  # fmt: skip
     return Reading(data, tuple(check.notes))
 
 
 def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, Any]:
-    """Arguments of `assemble` that come from the file's attributes."""
+    """Facts of the site that come from the file's attributes."""
     attributes = check.raw.attributes
     normalisation = str(attributes.get("normalisation", "none"))
     if normalisation not in NORMALISATIONS:
@@ -223,7 +227,6 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
         "normalisation": normalisation,
         "stand_in": None if stand_in is None else str(stand_in),
         "convergence_error": None if error is None else float(error),
-        "provenance": {str(k): str(v) for k, v in attributes.items() if k not in OWN_ATTRIBUTES},
     }
 
 

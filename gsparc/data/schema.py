@@ -142,10 +142,10 @@ class Site:
     array: np.ndarray | None
     carrier_hz: float | None
     subcarriers_hz: np.ndarray | None
-    origin: np.ndarray
-    box: np.ndarray
-    moving_box: np.ndarray
-    sha256: str
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    box: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+    moving_box: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+    sha256: str = ""
     normalisation: str = "none"
     target_scale: float = 1.0
     stand_in: str | None = None
