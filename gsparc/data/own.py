@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.data.assemble import bad_positions, centred, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import far_ends, peaks, too_strong
-from gsparc.data.conventions import Signals, mended
+from gsparc.data.conventions import mended
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
@@ -167,16 +167,24 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
+    site = Site(
+        kind=kind, static_end=static_end, grid=grid, array=array, carrier_hz=carrier,
+        subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
+        georeference=links.georeference, **about,
+    )  # fmt: skip
+    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES}
+    data = Measurements(
+        site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
+        station=links.station, place=links.place, censored=links.censored, run=links.run,
+        position_std=position_std,
+    )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
         check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
-    elif named:
-        signals = Signals(values, mask, tx, rx, rotation, frequency if kind == "csi" else None, array, grid)
-        signals = mended(signals, named)
-        values, mask, array, grid = signals.values, signals.mask, signals.array, signals.grid
+    data = data if kind == "rssi" else mended(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
-    target, scale = _scaled(measured, values, mask, links.censored)
+    target, scale = _scaled(measured, data.target, data.mask, links.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
@@ -186,17 +194,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
     noise = None if noise is None else (noise / scale**2).astype(np.float32)
-    site = Site(
-        kind=kind, static_end=links.static_end, grid=grid, array=array, carrier_hz=carrier,
-        target_scale=scale, subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
-        georeference=links.georeference, **about,
-    )  # fmt: skip
-    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES}
-    data = centred(Measurements(
-        site, tx, rx, rotation, target, mask, noise, directions, row_names, release_split, provenance,
-        station=links.station, place=links.place, censored=links.censored, run=links.run,
-        position_std=position_std,
-    ))  # fmt: skip
+    site = replace(data.site, target_scale=scale)
+    data = centred(replace(data, site=site, target=target, noise_variance=noise))
     return Reading(data, tuple(check.notes))
 
 
