@@ -24,6 +24,7 @@ from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links, Stations
 from gsparc.data.selection import Selection, select, take_rows
 
 POWERS = ("rssi", "rssi_db")
+NOT_HEARD = "powers were not heard: below sensitivity_db"
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 LEAST_LISTED = 3  # stations, for lists of the strongest
@@ -368,31 +369,15 @@ def _valid(check: Checker, measured: str, links: Links) -> Links | None:
         why = "nothing was heard in any row" if censored.any() else "nothing was measured"
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
-        _note_lost(check, measured, links.stations, keep, censored)
+        none = " or without any power" if measured == "spectrum" else ""
+        for flags, what in ((~keep, f"values are missing{none}"), (censored, NOT_HEARD)):
+            check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
         check.raw = replace(check.raw, arrays=arrays)
     if not side.any():
         return links
     arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
     return replace(links, censored=side)
-
-
-def _note_lost(
-    check: Checker, measured: str, stations: Stations | None, keep: np.ndarray, censored: np.ndarray
-) -> None:
-    """How many links have no value, and how many were not heard, by station."""
-    if not keep.all():
-        silent = " or without any power" if measured == "spectrum" else ""
-        text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
-        if stations is not None:
-            lost = np.bincount(check.raw.arrays["station"][~keep], minlength=len(stations))
-            most = [f"{stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
-            text += f" (most: {', '.join(most)})"
-        weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
-        check.notes.append(text + weak)
-    if censored.any():
-        count = int(censored.sum())
-        check.notes.append(f"{count} of {len(keep)} powers were not heard: below sensitivity_db")
 
 
 def _heights(check: Checker) -> bool:

@@ -95,9 +95,11 @@ class Builder:
         measured = self._measurement()
         # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
+        for role in ("sensitivity_db", "frequency_hz"):
+            if role in self.chosen and len(self.chosen[role][0].value) < 2:
+                values = self._of_rows(role)
+                self.arrays |= {} if values is None else {role: values}
         self._frequency(channels="csi" in self.arrays)
-        if "sensitivity_db" in self.chosen:
-            self._one("sensitivity_db")
         for role in ("run", "row_name"):
             if role in self.chosen:
                 self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
@@ -400,48 +402,38 @@ class Builder:
         if where.height is None:
             self.arrays[f"{name}_height"] = np.asarray(flat)
 
-    def _one(self, role: str) -> None:
-        """Add a number for all rows."""
-        column = self.chosen[role][0]
-        values = column.numbers(self.sheet)
+    def _of_rows(self, role: str) -> np.ndarray | None:
+        """Numbers (S,) of rows, () where all are one."""
+        values = self.chosen[role][0].numbers(self.sheet)
         if values is None:
-            return
+            return None
         different = np.unique(values[~np.isnan(values)])
-        if len(different) == 1:
-            self.arrays[role] = different[0]
-        else:
-            fault = f"{len(different)} values; expected one {role} for all rows"
-            self.refuse(fault, column.head or "")
+        return different[0] if len(different) == 1 else values
 
     def _frequency(self, channels: bool) -> None:
         """Add frequencies of tones, or the carrier."""
-        if "frequency_hz" in self.chosen:
-            column = self.chosen["frequency_hz"][0]
-            if len(column.value) == 2:
-                if not channels or len(self.tones) == 1:
-                    fault = f"two frequencies {column.value} for one tone"
-                    return self.refuse(f"dataset.columns.frequency_hz: {fault}")
-                # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
-                self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], column.value)
-                if np.ptp(np.diff(self.tones)):
-                    self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
-            else:
-                self._one("frequency_hz")
+        ends = self.chosen["frequency_hz"][0].value if "frequency_hz" in self.chosen else ()
+        if len(ends) == 2:
+            if not channels or len(self.tones) == 1:
+                return self.refuse(f"dataset.columns.frequency_hz: two frequencies {ends} for one tone")
+            # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
+            self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], ends)
+            if np.ptp(np.diff(self.tones)):
+                self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
         if "carrier_hz" not in self.chosen:
             return
         column = self.chosen["carrier_hz"][0]
-        values = column.numbers(self.sheet)
+        values = self._of_rows("carrier_hz")
         if values is None:
             return
-        unknown = np.flatnonzero(np.isnan(values))
         # Stations are told apart by their carriers: a row without one would be of none.
+        unknown = np.flatnonzero(np.isnan(values))
         self.sheet.refuse_rows(column.head, unknown, "no value; expected a frequency")
         # Numbers of 100 to 1e5 without a unit are MHz in the logs of phones and scanners; GHz are below 100.
         if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
             values = 1e6 * values
             self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
-        same = len(np.unique(values)) == 1
-        self.arrays["carrier_hz"] = values[0] if same else values
+        self.arrays["carrier_hz"] = values
         # Only a single tone lies at the carrier itself.
-        if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
-            self.arrays["frequency_hz"] = values[0]
+        if channels and not np.ndim(values) and self.arrays["csi"].ndim == 1:
+            self.arrays.setdefault("frequency_hz", values)
