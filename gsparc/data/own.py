@@ -145,7 +145,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     # Transposed images: their grid is that of the axes as they will be.
     height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
     grid = check.grid(height, width) if kind == "spectrum" else None
-    array = _array(check, values.shape[1] if kind == "csi" else None)
+    antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
+    array = check.real("array_position", (antennas, 3))
+    if array is not None and len(bad_positions(array)):
+        check.refuse("array_position", "not finite, or not on Earth; expected coordinates in metres")
     noise = _not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
@@ -248,14 +251,6 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         fault = f"shape {array.shape} holds too little; expected two rows or more"
         return check.refuse(name, fault), kind
     return array, kind
-
-
-def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
-    array = check.real("array_position", (antennas if antennas and antennas > 1 else None, 3))
-    if array is not None and len(bad_positions(array)):
-        fault = "not finite, or not on Earth; expected coordinates in metres"
-        return check.refuse("array_position", fault)
-    return array
 
 
 def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
