@@ -14,6 +14,7 @@ from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
+LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
@@ -126,7 +127,7 @@ def _box(places: np.ndarray) -> str:
 
 
 def suspicious_values(data: Measurements) -> list[str]:
-    """Warn of readable but implausible values: millimetres, degrees, powers of zero."""
+    """Warn of readable but implausible values: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
     hints = []
     if not np.ptp(data.moving, axis=0).any():
@@ -135,12 +136,27 @@ def suspicious_values(data: Measurements) -> list[str]:
         places, zones = ends[np.isfinite(ends).all(axis=1)], data.provenance.get("zones", "")
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         hints = _units(places, zones) or _units(data.moving[:, :3] + site.origin, zones)
+    if site.array is not None and site.wavelength is not None:
+        reach = float(np.ptp(site.array, axis=0).max())
+        if reach > LONG_ARRAY * site.wavelength:
+            waves = f"{reach / site.wavelength:.3g} wavelengths"
+            hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+    if site.grid is not None:
+        turn = np.degrees(site.grid.azimuth_step * site.grid.width)
+        # Steps in radians taken for degrees: the columns then span 2 pi degrees.
+        if abs(turn / (2 * np.pi) - 1) < 0.02:
+            hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target == 0).any():
         count = int((data.target == 0).sum())
         hints.append(
             f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
             "rssi_db and sensitivity_db"
         )
+    if site.kind == "rssi" and (data.target > 0).all():
+        spread = 10 * float(np.log10(data.target.max() / data.target.min()))
+        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.
+        if 0 < spread < 0.1:
+            hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
     return hints
 
 
