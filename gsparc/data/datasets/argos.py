@@ -1,13 +1,13 @@
 """The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in, downlink out.
 
 The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Users' positions were not
-recorded: they are made of the uplink (`gsparc.data.uplink_places`), or the stand-in's truth. Every prediction
-therefore uses a fresh uplink of the same snapshot, if only to locate the user.
+recorded: they come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the stand-in's
+truth. Every prediction therefore uses a fresh uplink of the same snapshot, if only to locate the user.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ from gsparc.data.assemble import centred, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
 from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import choice, finite
+from gsparc.data.limits import finite
 from gsparc.data.own_checks import Checker
+from gsparc.data.position_encoder import EncoderSettings, encoder_for
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
-from gsparc.data.uplink_places import uplink_places
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
@@ -31,16 +31,24 @@ TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
 FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets are rebuilt
 
+Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
 
 def load_argos(
-    root: str | Path, *, antenna: int | str = 0, positions: str | bool = "uplink", align: bool = True
+    root: str | Path,
+    encoder: Encoder | None = None,
+    *,
+    antenna: int | str = 0,
+    positions: str | bool = "encoder",
+    align: bool = True,
 ) -> Measurements:
     """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
+        encoder: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
-        positions: `uplink`: made of it, or `true` where the folder has `positions.npy` (the stand-in).
+        positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
             offsets of the snapshot; a factor of modulus 1 changes no error.
 
@@ -65,7 +73,7 @@ def load_argos(
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
-    where = _places(root, positions, uplink, split)
+    where = _places(root, positions, encoder, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -144,11 +152,14 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
+def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
         return _true_positions(root / "positions.npy", len(up))
-    choice("uplink", "true").check("dataset.positions", of)
-    return uplink_places(up, np.arange(len(up)) if split is None else split[0])
+    if of != "encoder" or code is None:
+        raise DataError(f"dataset.positions={of!r}: expected encoder or true")
+    # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
+    rows = np.arange(len(up)) if split is None else split[0]
+    return code(up, rows)
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
@@ -161,10 +172,27 @@ def _true_positions(path: Path, rows: int) -> np.ndarray:
 
 
 class Argos(Release):
-    """The Argos release or any folder in its layout; settings of `load_argos` and `Release`."""
+    """The Argos release or any folder in its layout.
+
+    Args:
+        root, **rest: see `Release` and `load_argos`.
+        encoder: `file` or `folder`, and `EncoderSettings`.
+    """
 
     called, reader = "Argos", staticmethod(load_argos)
     hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
+
+    def __init__(
+        self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
+    ) -> None:
+        settings = dict(encoder or {})
+        file, room = settings.pop("file", None), Path(settings.pop("folder", "outputs/encoders"))
+        super().__init__(root, **rest)
+        self.encoder = (room, EncoderSettings(**settings), file)
+
+    def read(self, folder: Path) -> Measurements:
+        """Read downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
+        return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
 class ArgosSim(Argos):
