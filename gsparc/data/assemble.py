@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from gsparc.data.blocks import blocks, contents
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
-from gsparc.data.schema import Links, Measurements, Site, TrainTest
+from gsparc.data.schema import Measurements
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
@@ -91,72 +91,38 @@ def _fact_text(fact: Any) -> str:
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 
-def assemble(
-    *,
-    static_end: Literal["rx", "tx"] | None,
-    tx: np.ndarray,
-    rx: np.ndarray,
-    rx_rotation: np.ndarray,
-    target: np.ndarray,
-    target_scale: float = 1.0,
-    mask: np.ndarray | None = None,
-    noise_variance: np.ndarray | None = None,
-    directions: list[np.ndarray] | None = None,
-    row_names: list[str] | None = None,
-    release_split: TrainTest | None = None,
-    provenance: Mapping[str, str] | None = None,
-    array: np.ndarray | None = None,
-    carrier_hz: float | None = None,
-    subcarriers_hz: np.ndarray | None = None,
-    links: Links | None = None,
-    position_std: np.ndarray | None = None,
-    **facts: Any,
-) -> Measurements:
-    """Centre measurements on the scene box, from validated world coordinates.
+def centred(data: Measurements) -> Measurements:
+    """Return measurements in world coordinates about the middle of their box, with their hash.
 
     Args:
-        static_end, array, carrier_hz, subcarriers_hz, **facts: see `Site`.
-        tx, rx: (S, 3) [m], world coordinates, float64.
-        rx_rotation: (S, 3, 3), local to world.
-        target: (S, ...) already divided by `target_scale`.
-        target_scale: stored target = physical target / target_scale.
-        noise_variance: (S,) in units of the stored target.
-        release_split: (train, test) rows that the data themselves name.
-        mask, directions, row_names, provenance, position_std: see `Measurements`.
-        links: of several stations, censored or unknown ends; None where there is nothing to say.
+        data: ends and stations in float64, validated, targets divided by `site.target_scale`; of the site
+            `origin`, the boxes, `sha256`, `static_position` and `rx_rotation` are set here.
     """
-    links = links or Links(static_end)
-    stations = links.stations
+    site, tx, rx = data.site, data.tx, data.rx_position
+    stations, static = site.stations, site.static_end
     # A place far outside would put the middle there, where float32 has lost centimetres.
-    usual = ~too_far(tx if static_end == "rx" else rx)
+    usual = ~too_far(tx if static == "rx" else rx)
     ends = np.concatenate([tx[usual], rx[usual]])
     ends = ends[np.isfinite(ends).all(axis=1)]  # without what stands at an unknown place
-    lower, upper = ends.min(axis=0), ends.max(axis=0)
-    origin = (lower + upper) / 2
-    places = {"rx": tx - origin, "tx": rx - origin}
-    moving = np.hstack([tx - origin, rx - origin]) if static_end is None else places[static_end]
-    hashed = {
-        "tx": tx, "rx": rx, "rx_rotation": rx_rotation, "target": target, "mask": mask, "array": array,
-        "target_scale": np.array(target_scale), "subcarriers_hz": subcarriers_hz,
-        "carrier_hz": None if carrier_hz is None else np.array(carrier_hz), "noise_variance": noise_variance,
-        "station": links.station, "place": links.place, "censored": links.censored, "run": links.run,
-        "carriers_hz": None if stations is None else stations.carrier_hz, "position_std": position_std,
+    origin = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    moved = replace(data, tx=tx - origin, rx_position=rx - origin)
+    moving = moved.moving[usual]
+    of_rows = ("tx", "rx_rotation", "target", "mask", "noise_variance", "station", "place", "censored", "run",
+               "position_std")  # fmt: skip
+    hashed = {name: getattr(data, name) for name in of_rows} | {
+        "rx": rx, "array": site.array, "subcarriers_hz": site.subcarriers_hz,
+        "target_scale": np.array(site.target_scale),
+        "carrier_hz": None if site.carrier_hz is None else np.array(site.carrier_hz),
+        "carriers_hz": None if stations is None else stations.carrier_hz,
     }  # fmt: skip
     still = None
-    if static_end is not None and (stations is None or len(stations) == 1):
-        still = (rx if static_end == "rx" else tx)[0] - origin
+    if static is not None and (stations is None or len(stations) == 1):
+        still = (rx if static == "rx" else tx)[0] - origin
         still = still if np.isfinite(still).all() else None
-    site = Site(
-        static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
-        origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),
-        target_scale=target_scale, static_position=still, georeference=links.georeference,
-        moving_box=np.stack([moving[usual].min(axis=0), moving[usual].max(axis=0)]),
+    site = replace(
+        site, origin=origin, box=np.stack([ends.min(axis=0) - origin, ends.max(axis=0) - origin]),
+        moving_box=np.stack([moving.min(axis=0), moving.max(axis=0)]), sha256=content_hash(hashed),
+        static_position=still, rx_rotation=np.array(data.rx_rotation[0], dtype=np.float64),
         stations=None if stations is None else replace(stations, position=stations.position - origin),
-        rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
     )  # fmt: skip
-    names = row_names or [f"row {i}" for i in range(len(target))]
-    return Measurements(
-        site, tx - origin, rx - origin, rx_rotation, target, mask, noise_variance, directions, names,
-        release_split, dict(provenance or {}), station=links.station, place=links.place,
-        censored=links.censored, run=links.run, position_std=position_std,
-    )  # fmt: skip
+    return replace(moved, site=site)

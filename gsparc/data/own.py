@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, bad_positions, rounded_rms
+from gsparc.data.assemble import bad_positions, centred, rounded_rms
 from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import far_ends, peaks, too_strong
-from gsparc.data.conventions import Signals, mended
+from gsparc.data.conventions import mended
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements, Site
+from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.units import LINEAR, PowerUnit
 
 log = logging.getLogger(__name__)
@@ -96,12 +97,17 @@ def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> 
     return interpret(raw, "arrays").data
 
 
-def interpret(raw: Raw, source: str | Path) -> Reading:
+def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     """Validate `raw` and centre, scale and hash it.
 
     CSI is divided by its root mean square over all measured entries, RSSI by its mean power; spectra of
     floating point are divided by their largest value unless it lies between 0.1 and 1. The constant is
     one per site, rounded to whole decibels, and kept as `site.target_scale`: metrics multiply it back.
+
+    Args:
+        raw: named as in docs/reference/schema.md.
+        source: for messages.
+        part: of the campaign that is used.
 
     Raises:
         DataError: all problems, with array and row.
@@ -110,7 +116,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check.names()
     measured = check.measurement()
     about = _attributes(check, Path(source).stem, measured)
-    links = None if measured is None else expand(check, measured)
+    links = None if measured is None else expand(check, measured, part)
     # Without a measurement no array has a length to be checked against: nothing more can be said.
     if measured is None or links is None:
         check.problems.raise_if_any()
@@ -139,7 +145,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     # Transposed images: their grid is that of the axes as they will be.
     height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
     grid = check.grid(height, width) if kind == "spectrum" else None
-    array = _array(check, values.shape[1] if kind == "csi" else None)
+    antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
+    array = check.real("array_position", (antennas, 3))
+    if array is not None and len(bad_positions(array)):
+        check.refuse("array_position", "not finite, or not on Earth; expected coordinates in metres")
     noise = _not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
@@ -161,16 +170,24 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
+    site = Site(
+        kind=kind, static_end=static_end, grid=grid, array=array, carrier_hz=carrier,
+        subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
+        georeference=links.georeference, **about,
+    )  # fmt: skip
+    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES}
+    data = Measurements(
+        site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
+        station=links.station, place=links.place, censored=links.censored, run=links.run,
+        position_std=position_std,
+    )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
         check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
-    elif named:
-        signals = Signals(values, mask, tx, rx, rotation, frequency if kind == "csi" else None, array, grid)
-        signals = mended(signals, named)
-        values, mask, array, grid = signals.values, signals.mask, signals.array, signals.grid
+    data = data if kind == "rssi" else mended(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
-    target, scale = _scaled(measured, values, mask, links.censored)
+    target, scale = _scaled(measured, data.target, data.mask, links.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
@@ -180,18 +197,13 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
     noise = None if noise is None else (noise / scale**2).astype(np.float32)
-    data = assemble(
-        kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
-        target_scale=scale, noise_variance=noise, directions=directions, grid=grid, array=array,
-        carrier_hz=carrier, subcarriers_hz=frequency if kind == "csi" else None,
-        row_names=row_names, release_split=release_split, links=links,
-        position_std=position_std, **about,
-    )  # fmt: skip
+    site = replace(data.site, target_scale=scale)
+    data = centred(replace(data, site=site, target=target, noise_variance=noise))
     return Reading(data, tuple(check.notes))
 
 
 def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, Any]:
-    """Arguments of `assemble` that come from the file's attributes."""
+    """Facts of the site that come from the file's attributes."""
     attributes = check.raw.attributes
     normalisation = str(attributes.get("normalisation", "none"))
     if normalisation not in NORMALISATIONS:
@@ -217,7 +229,6 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
         "normalisation": normalisation,
         "stand_in": None if stand_in is None else str(stand_in),
         "convergence_error": None if error is None else float(error),
-        "provenance": {str(k): str(v) for k, v in attributes.items() if k not in OWN_ATTRIBUTES},
     }
 
 
@@ -240,14 +251,6 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         fault = f"shape {array.shape} holds too little; expected two rows or more"
         return check.refuse(name, fault), kind
     return array, kind
-
-
-def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
-    array = check.real("array_position", (antennas if antennas and antennas > 1 else None, 3))
-    if array is not None and len(bad_positions(array)):
-        fault = "not finite, or not on Earth; expected coordinates in metres"
-        return check.refuse("array_position", fault)
-    return array
 
 
 def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:

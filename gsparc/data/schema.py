@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -51,6 +52,13 @@ class Stations:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def at(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
+        """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
+        optional = (self.rotation, self.carrier_hz, self.sector)
+        rotation, carrier, sector = (None if one is None else one[numbers] for one in optional)
+        called = tuple(names or (self.name[i] for i in numbers))
+        return Stations(self.position[numbers], called, rotation, carrier, sector)
 
 
 @dataclass(frozen=True)
@@ -134,10 +142,10 @@ class Site:
     array: np.ndarray | None
     carrier_hz: float | None
     subcarriers_hz: np.ndarray | None
-    origin: np.ndarray
-    box: np.ndarray
-    moving_box: np.ndarray
-    sha256: str
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    box: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+    moving_box: np.ndarray = field(default_factory=lambda: np.zeros((2, 3)))
+    sha256: str = ""
     normalisation: str = "none"
     target_scale: float = 1.0
     stand_in: str | None = None

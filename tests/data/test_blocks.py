@@ -13,10 +13,11 @@ from releases import write_release
 
 from gsparc.data import blocks, raw
 from gsparc.data.assemble import content_hash
-from gsparc.data.conventions import Signals, mended
+from gsparc.data.conventions import mended
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own, write_own
+from gsparc.data.schema import Measurements, Site
 from gsparc.models.target_rows import training_targets
 
 
@@ -52,8 +53,9 @@ def unchunked(path, values):
 def test_tones_that_are_zero_in_a_block_alone_were_not_measured_there(small):
     values, none = arrays()["csi"], np.zeros((40, 3))
     values[:4, :, 2], values[:, :, 5] = 0, 0
-    signals = Signals(values, None, none, none, np.zeros((40, 3, 3)), arrays()["frequency_hz"])
-    mask = mended(signals, ["zeros_unmeasured"]).mask
+    site = Site("room", "csi", "rx", None, None, None, arrays()["frequency_hz"])
+    data = Measurements(site, none, none, np.zeros((40, 3, 3)), values)
+    mask = mended(data, ["zeros_unmeasured"]).mask
     assert mask[:, :, 2].all() and not mask[:, :, 5].any()
 
 

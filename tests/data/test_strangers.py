@@ -45,7 +45,6 @@ def long(heads: str, *more, level=LEVELS[:, 0], places=PLACES) -> str:
 
 
 FLOOR = RNG.integers(0, 3, ROWS)
-FARTHER = AWAY[:, 1] > AWAY[:, 2]
 BAND = RNG.integers(0, 2, ROWS)
 ZERO = np.where(np.arange(ROWS)[:, None] < 12, 0, np.c_[NORTH, EAST])
 
@@ -56,7 +55,6 @@ ZONES = PLACES + np.where(np.arange(ROWS)[:, None] < 80, [700_000, 5e6], [300_00
 WAY = np.c_[np.linspace(0, 60, ROWS), np.full(ROWS, 9.0)]
 ALONG = np.round(-30 - 70 * np.log10(1 + 0.3 * WAY[:, 0]), 1)
 STUCK = np.where((np.arange(ROWS)[:, None] > 60) & (np.arange(ROWS)[:, None] < 180), WAY[61], WAY)
-IN_FEET = table("name,x,y", "abc", *(AT / 0.3048).T)
 OF_THREE = [
     f"{name},{x},{y},{v}"
     for (x, y), row in zip(PLACES, LEVELS, strict=True)
@@ -81,9 +79,6 @@ CASES = {
         "dataset.columns.x=LON dataset.columns.y=LAT", ""),
     "two zones": (long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES), {},
         "two groups of places 399.9 km apart, as column 'grid' says", "millimetres"),
-    "a stuck fix": (long("t", range(ROWS), level=ALONG, places=STUCK), {},
-        "line 63 to line 181: the place stands still", ""),
-    "a list in feet": (THREE, {"stations_file": IN_FEET}, "far better if the stations are in feet", ""),
     "floors": (long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR), {}, "dataset.columns.z=Storey*3.2",
         ""),
     "floors as metres": (long("floor", FLOOR), {"columns": {"z": "floor"}}, "floors as heights in metres?",
@@ -102,20 +97,10 @@ CASES = {
     "a confidence interval": (long("CI", 7 + BAND), {}, "stays       the transmitter", "stations"),
     "columns that are said": (long("site,antenna", 7 + 0 * BAND, BAND),
         {"columns": {"station": "site+antenna"}}, "2 stations, 2 of", ""),
-    "a column that splits": (long("site,antenna", 7 + 0 * BAND, BAND, level=LEVELS[:, 0] - 12 * BAND), {},
-        "dataset.columns.station=site+antenna tells them apart", ""),
-    "two cells of one name": (
-        long("site,layer", "a" * ROWS, FARTHER, level=np.where(FARTHER, LEVELS[:, 2], LEVELS[:, 1])),
-        {},
-        "another place for each value of column 'layer': dataset.columns.station=site+layer tells them apart",
-        "",
-    ),
     "streets of one cell": (long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])), {},
         "1 stations", "warning"),
     "hopping": (long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)), {},
         "1 stations", "warning"),
-    "a rounded name": (long("gateway_eui", np.where(BAND == 1, "1.2E+15", "b")), {},
-        "rounded by a spreadsheet", ""),
     "a banner with a role in it": (
         "WigleWifi-1.6,model=x,device=x,display=kismet\n"
         + table(

@@ -8,7 +8,7 @@ from releases import real
 from gsparc.data.own import interpret
 from gsparc.data.query import Query
 from gsparc.data.raw import read_raw
-from gsparc.data.selection import keep_above
+from gsparc.data.selection import Selection
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
@@ -201,7 +201,7 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
 def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
     """Squares of 0.6 m of the plane: a length of 1.8 m, an amplitude of 3e5 dB^2 and errors of 30 dB."""
     path = real("real/techtile-power-reci-rf-1.npz")
-    data = interpret(keep_above(read_raw(path), -75, path).raw, path).data
+    data = interpret(read_raw(path), path, Selection(min_rssi_db=-75)).data
     split = SplitSettings(name="blocks", side_m=0.6, seed=9)
     fold = make_split(data.moving, split, place=data.place).folds[0]
     method = GaussianProcess()

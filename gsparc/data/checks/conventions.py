@@ -1,6 +1,6 @@
 """Whether channels and spectra follow the schema's conventions, told by the direct path between known ends.
 
-Each rival of `CONVENTIONS`, and each two of them, is scored as the declared one is. Of channels the share of
+Each rival of `CONVENTIONS` is scored as the declared one is. Of channels the share of
 a row's power along the direct path counts, with a free factor for each row, free phases of the antennas and a
 free delay common to all rows, and whether the factors of rows agree; of spectra how much of the sphere is
 stronger than the direction of the other end. A row counts once, however many entries it has, since
@@ -10,14 +10,12 @@ reflections are common to them, and rows within half a wavelength count as one. 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import combinations
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.conventions import CONVENTIONS, Signals, mended
+from gsparc.data.conventions import CONVENTIONS, array_of, mended, traits, without_zeros
 from gsparc.data.errors import some
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
@@ -31,7 +29,6 @@ COHERENT = 8  # antennas, tones or both with one factor: fewer fit anything
 ANY = {"csi": 0.01, "spectrum": 0.003}  # share that no path explains
 FIT = {"csi": 0.12, "spectrum": 0.8}  # of the median row, at least of a rival; a worse one says nothing
 ONE_DELAY, CLEAR = 0.7, 0.15  # the same of one delay for all rows, and its gain: reflections fit one, too
-GOOD = {"csi": 0.5, "spectrum": 0.95}  # of what is declared: with it no two conventions are tried together
 HALVINGS = 3  # of the places, into groups
 DROPPED = 2  # groups that speak most for a rival: the others must do so, too
 SHARED = 8  # rows with one phase, at least
@@ -66,54 +63,50 @@ def convention_warnings(data: Measurements) -> list[str]:
     kind = data.site.kind
     if kind == "rssi":
         return []
-    of_file = Signals.of(data)
-    signals, labels = _arrayed(data, of_file)
-    rows = _drawn(signals)
-    few, signals, labels = of_file.rows(rows[:1]), signals.rows(rows), labels[rows]
-    zeros = _zeros(signals) if kind == "csi" and len(rows) else []  # none where an end is at an unknown place
-    entries = signals.values.shape[2] * (1 if signals.array is None else signals.values.shape[1])
+    whole, labels = _arrayed(data)
+    rows = _drawn(whole)
+    few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]
+    zeros = _zeros(drawn) if kind == "csi" and len(rows) else []  # none where an end is at an unknown place
+    entries = drawn.target.shape[2] * (1 if array_of(drawn) is None else drawn.target.shape[1])
     if len(rows) < FEWEST[kind]:
         return zeros
     if kind == "csi":
-        signals = CONVENTIONS["zeros_unmeasured"].change(signals)
-        return [*zeros, *_rivals(signals, few, labels)] if entries >= COHERENT else zeros
-    return _rivals(signals, few, labels) + _decibels(signals, data.site.target_scale)
+        return [*zeros, *_rivals(without_zeros(drawn), few, labels)] if entries >= COHERENT else zeros
+    return _rivals(drawn, few, labels) + _decibels(drawn)
 
 
-def _arrayed(data: Measurements, signals: Signals) -> tuple[Signals, np.ndarray]:
+def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
     stations = data.site.stations
     run = np.zeros(len(data), np.int64) if data.run is None else data.run
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    single = signals.tones is not None and signals.values.shape[1] == 1
+    single = data.site.kind == "csi" and data.target.shape[1] == 1
     if stations is None or data.place is None or len(stations) < COHERENT or not single:
-        return signals, run * (int(station.max()) + 1) + station
+        return data, run * (int(station.max()) + 1) + station
     heard = Snapshots.of(data, np.arange(len(data)))
-    measured = np.ones(signals.values.shape, bool) if signals.mask is None else signals.mask
+    measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
     ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
-    array = stations.position[heard.stations] - middle
-    mask = heard.arranged(measured) != 0
-    return Signals(heard.values, mask, *ends, signals.tones, array), heard.run
+    site = replace(data.site, array=stations.position[heard.stations] - middle)
+    return Measurements(site, *ends, heard.values, heard.arranged(measured) != 0), heard.run
 
 
-def _drawn(signals: Signals) -> np.ndarray:
+def _drawn(data: Measurements) -> np.ndarray:
     """Rows (n,) at places of their own, drawn at random; channels half a wavelength apart."""
-    place = np.hstack([signals.tx, signals.rx])
+    place, kind = np.hstack([data.tx, data.rx_position]), data.site.kind
     known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    kind = "spectrum" if signals.tones is None else "csi"
     order = np.random.default_rng(0).permutation(known)[: 20 * ROWS]
     if not len(order):
         return order
     side = float(np.ptp(place[order], axis=0).max()) / ROWS + 1e-9
-    side = side if signals.tones is None else max(side, signals.wavelength / 2)
+    side = side if kind == "spectrum" else max(side, LIGHT / float(data.site.tones().mean()) / 2)
     cells = np.floor((place[order] - place[order].min(axis=0)) / side)
     first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return order[first[: min(ROWS, max(LEAST, ENTRIES[kind] // signals.values[0].size))]]
+    return order[first[: min(ROWS, max(LEAST, ENTRIES[kind] // data.target[0].size))]]
 
 
-def _zeros(signals: Signals) -> list[str]:
-    measured = signals.values != 0 if signals.mask is None else (signals.values != 0) | ~signals.mask
+def _zeros(data: Measurements) -> list[str]:
+    measured = data.target != 0 if data.mask is None else (data.target != 0) | ~data.mask
     zero = np.flatnonzero(~measured.any(axis=(0, 1)))
     if not len(zero):
         return []
@@ -121,47 +114,32 @@ def _zeros(signals: Signals) -> list[str]:
     return [f"{which}: guards, or the direct current? dataset.zeros_unmeasured=true: they were not measured"]
 
 
-def _rivals(signals: Signals, few: Signals, labels: np.ndarray) -> list[str]:
+def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
-    kind, place = "csi" if signals.grid is None else "spectrum", np.hstack([signals.tx, signals.rx])
-    names = [n for n, one in CONVENTIONS.items() if one.tried and one.applies(few)]
-    groups, declared = _groups(place), _score(signals, labels)
+    kind, place = data.site.kind, np.hstack([data.tx, data.rx_position])
+    names = [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(few)]
+    groups, declared = _groups(place), _score(data, labels)
     rivals = {}
-    pairs = combinations(names, 2) if declared.fit < GOOD[kind] else ()
-    for chosen in [*((name,) for name in names), *pairs]:
+    for name in names:
         with suppress(ValueError):  # a grid turned beyond a pole
-            rivals[chosen] = _score(mended(signals, chosen), labels)
+            rivals[name] = _score(mended(data, [name]), labels)
 
-    def may_be(chosen: tuple[str, ...], rival: Score) -> bool:
+    def may_be(name: str, rival: Score) -> bool:
         gain = float((rival.rows - declared.rows).mean())
-        clear = "delays_removed" not in chosen or (rival.fit > ONE_DELAY and gain > CLEAR)
+        clear = name != "delays_removed" or (rival.fit > ONE_DELAY and gain > CLEAR)
         return clear and rival.fit > FIT[kind]
 
-    def wins(rival: Score, over: Score) -> bool:
-        gain = rival.rows - over.rows
-        of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
-        return float(of_group[:-DROPPED].sum()) + (rival.phases - over.phases) / 2 > RATIO
-
-    rivals = {chosen: one for chosen, one in rivals.items() if may_be(chosen, one)}
-    best: tuple[str, ...] = ()
-    for count in (1, 2):
-        fit = {chosen: one.total for chosen, one in rivals.items() if len(chosen) == count}
-        first = max(fit, key=lambda chosen: fit[chosen], default=())
-        if first and wins(rivals[first], rivals[best] if best else declared):
-            best = first
-    if not best:
+    rivals = {name: one for name, one in rivals.items() if may_be(name, one)}
+    best = max(rivals.values(), key=lambda one: one.total, default=declared)
+    gain = best.rows - declared.rows
+    of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
+    if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
-    least = rivals[best].total - RATIO
-    best, *alike = [c for c, one in rivals.items() if len(c) == len(best) and one.total > least]
-    said = " and ".join(CONVENTIONS[name].words for name in best)
-    others = "".join(f" or {_setting(chosen)}" for chosen in alike)
+    named, *alike = [name for name, one in rivals.items() if one.total > best.total - RATIO]
+    others = "".join(f" or dataset.{name}=true" for name in alike)
     others += ", which these rows do not tell apart" if others else ""
-    how = f"{len(signals.values)} rows drawn fit the direct path more than 1,000 times better with {said}"
-    return [f"{how}: is it that? {_setting(best)}{others} mends it"]
-
-
-def _setting(chosen: Iterable[str]) -> str:
-    return " ".join(f"dataset.{name}=true" for name in chosen)
+    how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better with "
+    return [f"{how}{CONVENTIONS[named].words}: is it that? dataset.{named}=true{others} mends it"]
 
 
 def _groups(place: np.ndarray) -> np.ndarray:
@@ -175,17 +153,17 @@ def _groups(place: np.ndarray) -> np.ndarray:
     return part
 
 
-def _score(signals: Signals, labels: np.ndarray) -> Score:
-    return _spectra(signals) if signals.tones is None else _channels(signals, signals.tones, labels)
+def _score(data: Measurements, labels: np.ndarray) -> Score:
+    return _spectra(data) if data.site.kind == "spectrum" else _channels(data, data.site.tones(), labels)
 
 
-def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
+def _channels(data: Measurements, tones: np.ndarray, labels: np.ndarray) -> Score:
     """By the share of power along the direct path, with factors of rows and antennas and a common delay."""
-    measured = np.ones(signals.values.shape, bool) if signals.mask is None else signals.mask
-    values = np.where(measured, signals.values, 0).astype(np.complex128)
-    away = (signals.tx - signals.rx)[:, None]
-    if signals.array is not None:
-        away = away - np.einsum("sij,aj->sai", signals.rotation, signals.array)
+    measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
+    values = np.where(measured, data.target, 0).astype(np.complex128)
+    away, array = (data.tx - data.rx_position)[:, None], array_of(data)
+    if array is not None:
+        away = away - np.einsum("sij,aj->sai", data.rx_rotation, array)
     distance = np.linalg.norm(away, axis=2)
     direct = values * np.exp(2j * np.pi * distance[..., None] * tones / LIGHT)
     spacing = float(np.median(np.diff(np.sort(tones)))) if len(tones) > 1 else 1.0
@@ -193,7 +171,7 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
     delays = (np.arange(count) - count // 2) / count / spacing
     antennas = direct @ np.exp(2j * np.pi * np.outer(tones - tones.mean(), delays))
     used = measured.sum(axis=(1, 2)).astype(float)
-    if signals.array is None:
+    if array is None:
         used /= measured.any(axis=2).sum(axis=1).clip(1)
     power = (used * (np.abs(values) ** 2).sum(axis=(1, 2))).clip(1e-300)
 
@@ -202,7 +180,7 @@ def _channels(signals: Signals, tones: np.ndarray, labels: np.ndarray) -> Score:
         delay = int(rows.sum(axis=0).argmax())
         return rows[:, delay], delay
 
-    if signals.array is None:
+    if array is None:
         rows, delay = best((np.abs(antennas) ** 2).sum(axis=1))
         factor = antennas[:, 0, delay]
     else:
@@ -230,17 +208,17 @@ def _common(factor: np.ndarray, labels: np.ndarray) -> float:
     return total
 
 
-def _spectra(signals: Signals) -> Score:
+def _spectra(data: Measurements) -> Score:
     """By the share of the sphere that is stronger than the direction of the other end; half of it outside."""
-    grid = signals.grid
+    grid = data.site.grid
     assert grid is not None
-    x, y, z = np.einsum("sji,sj->is", signals.rotation, signals.tx - signals.rx)
+    x, y, z = np.einsum("sji,sj->is", data.rx_rotation, data.tx - data.rx_position)
     row = np.rint((np.arctan2(z, np.hypot(x, y)) - grid.first_elevation) / grid.elevation_step).astype(int)
     column = np.rint((np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.turn).astype(int)
     column = column % grid.width if grid.periodic else column
     inside = (row >= 0) & (row < grid.height) & (column < grid.width)
     angle = grid.solid_angles().numpy() / float(grid.solid_angles().sum())
-    values = signals.values.reshape(len(row), grid.height, grid.width)
+    values = data.target.reshape(len(row), grid.height, grid.width)
     at = values[np.arange(len(row)), row.clip(0, grid.height - 1), column.clip(0, grid.width - 1)]
     at = at[:, None, None]
     stronger = (((values > at) + 0.5 * (values == at)) * angle).sum(axis=(1, 2))
@@ -248,14 +226,14 @@ def _spectra(signals: Signals) -> Score:
     return Score(-np.log(stronger + ANY["spectrum"]), 0.0, 1 - 2 * float(np.median(stronger)))
 
 
-def _decibels(signals: Signals, scale: float) -> list[str]:
+def _decibels(data: Measurements) -> list[str]:
     """A warning where the strongest lobes of spectra fall as parabolas to their edges, not as beams do."""
-    grid, values = signals.grid, signals.values.astype(np.float64) * scale
+    grid, values = data.site.grid, data.target.astype(np.float64) * data.site.target_scale
     assert grid is not None
-    if signals.values.dtype.kind != "f" or values.max() < LEAST_DB:
+    if data.target.dtype.kind != "f" or values.max() < LEAST_DB:
         return []
     gains = np.array([_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values])
-    groups, gains = _groups(np.hstack([signals.tx, signals.rx])), np.nan_to_num(gains)
+    groups, gains = _groups(np.hstack([data.tx, data.rx_position])), np.nan_to_num(gains)
     of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
     if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
         return []

@@ -28,6 +28,7 @@ NEIGHBOURS = 5  # rows on each side
 LONG_GAP = 20  # rows without a value in one piece
 EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
+RISE = 0.3  # correlation of level and logarithm of the distance
 WEAK_DB = 6.0  # above the weakest value: heard only just
 
 
@@ -38,7 +39,7 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels) + stuck(levels)
+    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
     return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
@@ -117,35 +118,17 @@ def not_heard(values: np.ndarray) -> list[float]:
         rest = rest[~np.isin(rest, found)]
 
 
-# What a list of stations may be in by mistake, beside rows in metres, and what turns it right.
-RIVALS: dict[str, tuple[float, list[int]]] = {
-    "in feet": (0.3048, [0, 1, 2]),
-    "in metres, the rows in feet": (1 / 0.3048, [0, 1, 2]),
-    "with x and y exchanged": (1.0, [1, 0, 2]),
-}
-BETTER, STEEP = 0.3, -0.6  # in the correlation, and the correlation itself
-
-
 def direction_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of levels that rise with the distance, or fall far better from another place."""
+    """Warn of levels that rise with the distance."""
     if levels.station_position is None:
         return []
-    places = levels.station_position
-    declared = _correlation(levels, places)
-    turned = {words: factor * places[:, axes[: places.shape[1]]] for words, (factor, axes) in RIVALS.items()}
-    rivals = {words: _correlation(levels, place) for words, place in turned.items()}
-    best = min(rivals, key=lambda words: rivals[words])
-    if rivals[best] < min(STEEP, declared - BETTER):
-        return [
-            f"levels fall with the distance far better if the stations are {best} (correlation "
-            f"{rivals[best]:.2f} instead of {declared:.2f}): is their list in the unit and order of the rows?"
-        ]
-    if declared > 0.3:
-        return [
-            f"levels rise with distance (correlation {declared:.2f}): losses instead of levels (then say "
-            "dataset.columns.rssi_db=HEAD*-1), or are the stations, or x and y, elsewhere?"
-        ]
-    return []
+    rise = _correlation(levels, levels.station_position)
+    if rise <= RISE:
+        return []
+    return [
+        f"levels rise with distance (correlation {rise:.2f}): losses instead of levels (then say "
+        "dataset.columns.rssi_db=HEAD*-1), or are the stations, or x and y, elsewhere?"
+    ]
 
 
 def _correlation(levels: LinkLevels, places: np.ndarray) -> float:
@@ -158,26 +141,6 @@ def _correlation(levels: LinkLevels, places: np.ndarray) -> float:
         if len(used) >= 20 and np.ptp(spread[used]) > 0.3 and np.ptp(level) > 0:
             found.append(np.corrcoef(spread[used], level)[0, 1])
     return float(np.median(found)) if found else 0.0
-
-
-STILL_ROWS, MOVES_DB = 30, 20.0
-TREND = 0.5  # correlation of a level with the one before: a way, not fading at one place
-
-
-def stuck(levels: LinkLevels) -> list[str]:
-    """Warn of places that stand still over many rows while levels change as they do along a way."""
-    found = []
-    for _, used in levels.heard():
-        moves = np.flatnonzero((np.diff(levels.position[used], axis=0) != 0).any(axis=1)) + 1
-        for run in np.split(used, moves):
-            level = levels.level_db[run]
-            if len(run) < STILL_ROWS or np.diff(np.percentile(level, [5, 95]))[0] < MOVES_DB:
-                continue
-            if np.corrcoef(level[:-1], level[1:])[0, 1] > TREND:
-                what = f"the place stands still for {len(run)} rows, levels move by {np.ptp(level):.0f} dB"
-                rows = f"{levels.rows[run[0]]} to {levels.rows[run[-1]]}"
-                found.append(f"{rows}: {what}: a stuck fix? leave these rows out")
-    return found
 
 
 def copies(levels: LinkLevels) -> list[str]:

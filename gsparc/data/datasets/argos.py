@@ -8,13 +8,12 @@ truth. Every prediction therefore uses a fresh uplink of the same snapshot, if o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, rounded_rms
+from gsparc.data.assemble import centred, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
 from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
@@ -22,7 +21,7 @@ from gsparc.data.limits import finite
 from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import EncoderSettings, encoder_for
 from gsparc.data.raw import Raw
-from gsparc.data.schema import Measurements, TrainTest
+from gsparc.data.schema import Measurements, Site, TrainTest
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9
@@ -79,17 +78,18 @@ def load_argos(
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
     base, frequency = places.mean(axis=0), carrier + tones * spacing
-    data = assemble(
-        name=STAND_IN if simulated else "argos", stand_in="argos" if simulated else None,
-        kind="csi", grid=None, static_end="tx", tx=np.tile(base, (len(csi), 1)), rx=where,
-        rx_rotation=np.tile(np.eye(3), (len(csi), 1, 1)), target=target, target_scale=scale,
-        carrier_hz=carrier, subcarriers_hz=frequency[UPLINK:], release_split=split,
-        noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
-        row_names=[f"snapshot {i}" for i in range(len(csi))],
-        provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
+    site = Site(
+        STAND_IN if simulated else "argos", "csi", "tx", None, None, carrier, frequency[UPLINK:],
+        stand_in="argos" if simulated else None, target_scale=scale, uplink_array=places - base,
+        uplink_hz=frequency[:UPLINK], antennas=chosen,
     )  # fmt: skip
-    uplink_facts = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
-    return replace(data, site=replace(data.site, **uplink_facts), uplink=np.ascontiguousarray(uplink))
+    return centred(Measurements(
+        site, np.tile(base, (len(csi), 1)), where, np.tile(np.eye(3), (len(csi), 1, 1)), target,
+        noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
+        row_names=[f"snapshot {i}" for i in range(len(csi))], release_split=split,
+        provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
+        uplink=np.ascontiguousarray(uplink),
+    ))  # fmt: skip
 
 
 def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:

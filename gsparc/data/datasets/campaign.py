@@ -22,7 +22,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched, found
 from gsparc.data.raw import Raw, numbered_rows, read_raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
-from gsparc.data.selection import Selection, select
+from gsparc.data.selection import Selection
 
 log = logging.getLogger(__name__)
 
@@ -66,10 +66,9 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         raw = self.raw()
-        selected = select(raw, self.selection, self.file)
-        reading = interpret(selected.raw, self.file)
+        reading = interpret(raw, self.file, self.selection)
         left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *selected.notes, *reading.notes):
+        for note in (*left_out, *reading.notes):
             log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsparc.data.assemble import assemble, check_positions
+from gsparc.data.assemble import centred, check_positions
 from gsparc.data.blocks import empty
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.own_checks import is_unit, quaternion_to_matrix
-from gsparc.data.schema import LIGHT, Measurements, TrainTest
+from gsparc.data.schema import LIGHT, Measurements, Site, TrainTest
 from gsparc.ops import SphereGrid
 
 if TYPE_CHECKING:
@@ -88,17 +88,17 @@ def load_rfid(
     simulated = info.dataset == STAND_IN
     layout = {} if array is None else array
     places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
-    return assemble(
-        name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
-        kind="spectrum", static_end="rx", tx=positions[rows],
-        rx=np.repeat(info.position[None], len(rows), axis=0),
-        rx_rotation=np.repeat(info.rotation[None], len(rows), axis=0),
-        target=spectra if listed is None else spectra[rows],
-        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=str(normalisation),
-        array=places, carrier_hz=LIGHT / float(wavelength_m), release_split=release_split,
-        row_names=[f"spectrum/{i + 1:05d}.png" for i in rows],
-        provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
+    site = Site(
+        STAND_IN if simulated else "rfid", "spectrum", "rx", SphereGrid.hemisphere(HEIGHT, WIDTH), places,
+        LIGHT / float(wavelength_m), None, normalisation=str(normalisation),
+        stand_in="rfid" if simulated else None,
     )  # fmt: skip
+    rx, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, info.rotation))
+    return centred(Measurements(
+        site, positions[rows], rx, rotation, spectra if listed is None else spectra[rows],
+        row_names=[f"spectrum/{i + 1:05d}.png" for i in rows], release_split=release_split,
+        provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
+    ))  # fmt: skip
 
 
 def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, TrainTest | None]:

@@ -21,9 +21,10 @@ from gsparc.data.links.strongest import Lists, moments
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, Links, Stations
-from gsparc.data.selection import take_rows
+from gsparc.data.selection import Selection, select, take_rows
 
 POWERS = ("rssi", "rssi_db")
+NOT_HEARD = "powers were not heard: below sensitivity_db"
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 LEAST_LISTED = 3  # stations, for lists of the strongest
@@ -33,16 +34,19 @@ STATION_FIELDS = ("station", "station_position", "station_name", "station_orient
 OF_ROWS = ("station", "place", "run")  # arrays that go into `Links`
 
 
-def expand(check: Checker, measured: str) -> Links | None:
+def expand(check: Checker, measured: str, part: Selection) -> Links | None:
     """Replace `check.raw` by one row per link of the plain schema; None where something is wrong (noted).
 
     Args:
         check: of the file; notes say what was left out.
         measured: name of the measurement.
+        part: of the campaign.
     """
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
     if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
-        check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
+        rows = len(check.raw.arrays[measured])
+        check.raw.arrays.setdefault("row_name", numbered_rows(rows))
+        check.raw.arrays["file_row"] = np.arange(rows)
     before = len(check.problems)  # what is already noted does not keep from noting more
     # Rows without a fix go before the projection: 0, 0 degrees would move its origin far from the site.
     _without_fix(check, measured)
@@ -50,26 +54,38 @@ def expand(check: Checker, measured: str) -> Links | None:
     if len(check.problems) > before or not _heights(check):
         return None
     read = _with_table if "station_position" in check.raw.arrays else _without_table
-    links = read(check, measured)
+    links = read(check, measured, part)
     if links is None:
         return None
     held = check.raw.arrays
-    parts: dict[str, Any] = {name: held.pop(name) for name in OF_ROWS if name in held}
+    of_rows: dict[str, Any] = {name: held.pop(name) for name in OF_ROWS if name in held}
     if links.stations is not None:
         # From here on rows have positions of their own, as in a file of one static end.
-        held[f"{links.static_end}_position"] = links.stations.position[parts["station"]]
+        held[f"{links.static_end}_position"] = links.stations.position[of_rows["station"]]
         if links.stations.rotation is not None:
-            held["rx_rotation"] = links.stations.rotation[parts["station"]]
-    return replace(links, georeference=origin, **parts)
+            held["rx_rotation"] = links.stations.rotation[of_rows["station"]]
+    return replace(links, georeference=origin, **of_rows)
 
 
-def _without_table(check: Checker, measured: str) -> Links | None:
-    """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
+def _selected(check: Checker, measured: str, stations: Stations | None, part: Selection) -> Stations | None:
+    """Leave out what `part` does not hold, and number runs and places anew; the stations that are left."""
     arrays = check.raw.arrays
+    if arrays[measured].ndim:
+        arrays, stations, notes = select(arrays, measured, stations, part, check.source)
+        check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
+        runs = check.array("run", arrays[measured].shape[:1])
+        arrays |= {} if runs is None else {"run": np.unique(runs, return_inverse=True)[1].reshape(-1)}
+        arrays |= {} if "place" not in arrays else {"place": numbered(arrays["place"])}
+    return stations
+
+
+def _without_table(check: Checker, measured: str, part: Selection) -> Links | None:
+    """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
     for name in check.given(*STATION_FIELDS):
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
+    _selected(check, measured, None, part)
+    arrays = check.raw.arrays
     rows = len(arrays[measured]) if arrays[measured].ndim else 0
-    _number_runs(check, rows)
     # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
     if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")
@@ -88,7 +104,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
     return _valid(check, measured, links)
 
 
-def _with_table(check: Checker, measured: str) -> Links | None:
+def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
     stations = station_table(check, measured in (*POWERS, "csi"))
@@ -109,9 +125,9 @@ def _with_table(check: Checker, measured: str) -> Links | None:
             measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
             "or say which station each row is of with `station` (S,)",
         )  # fmt: skip
-    _number_runs(check, rows)
     station = station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
-    carriers = check.real("carrier_hz", (), (count,), (rows,))
+    row = np.repeat(np.arange(rows), 1 if long else count)
+    stated = {name: check.real(name, (), (count,), (rows,)) for name in ("carrier_hz", "sensitivity_db")}
     positions = check.real(ends[0], (rows, 3))
     if static == "tx" and stations.rotation is not None:
         check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
@@ -121,9 +137,16 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     if not long:  # a wide row becomes as many rows as there are stations, side by side
         check.raw = _unrolled(check.raw, measured, count)
     check.raw.arrays["station"] = station
-    stations = by_carrier(check, stations, carriers, rows, hopping=measured in POWERS)
+    for name, value in stated.items():
+        if value is not None and value.ndim:  # of as many rows as stations, carriers are taken as of rows
+            by_row = len(value) == rows and (rows != count or name == "carrier_hz")
+            check.raw.arrays[name] = value[row if by_row else station]
+            if by_row and rows == count and len(np.unique(value)) > 1:
+                said = "as many values as rows and as stations; taken as one for each row"
+                check.notes.append(f"{name}: {said}")
     for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
+    stations = by_carrier(check, _selected(check, measured, stations, part) or stations, measured in POWERS)
     absent = check.raw.attributes.get("absent", "auto")
     if long and absent == "silent":
         _with_absent(check, measured, len(stations))
@@ -136,13 +159,26 @@ def _with_absent(check: Checker, measured: str, count: int) -> None:
     """Add a row that was not heard for each place and station, of `count`, without one."""
     if measured != "rssi_db":
         return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
-    station, place = (check.raw.arrays[name] for name in ("station", "place"))
-    _, first, of_place = np.unique(place, return_index=True, return_inverse=True)
+    arrays = check.raw.arrays
+    _, first, of_place = np.unique(arrays["place"], return_index=True, return_inverse=True)
     # Links are numbered place by station, so that those without a row are a set difference.
-    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + station)
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + arrays["station"])
+    floor = _floors(arrays, count)
     # Minus infinity lies below whatever turns out to be the limit of hearing.
-    _repeat(check, np.r_[: len(station), first[lost // count]], lost % count)
+    _repeat(check, np.r_[: len(of_place), first[lost // count]], lost % count)
+    if floor is not None and floor.ndim:
+        check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[lost % count]
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+
+
+def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:
+    """The sensitivity (), or (T,) of `count` stations where their rows agree; None elsewhere, or without."""
+    floor = arrays.get("sensitivity_db")
+    if floor is None or floor.ndim == 0:
+        return floor
+    each = np.full(count, floor.min())
+    each[arrays["station"]] = floor
+    return each if np.array_equal(each[arrays["station"]], floor, equal_nan=True) else None
 
 
 def _repeat(check: Checker, like: np.ndarray, station: np.ndarray) -> None:
@@ -157,12 +193,10 @@ def _repeat(check: Checker, like: np.ndarray, station: np.ndarray) -> None:
 def _with_unlisted(check: Checker, stations: Stations, static: End) -> None:
     """Add to lists of the strongest rows, twice as many as are listed, of stations that they leave out."""
     arrays, count = check.raw.arrays, len(stations)
-    levels, of = arrays["rssi_db"], arrays["station"]
+    levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and levels.dtype.kind in "iuf" and "mask" not in arrays
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
-    level = check.real("sensitivity_db", (), (count,), (len(of),))
-    known = level is None or level.shape in ((), (count,))  # of stations, if at all: lists have no other
-    if count < LEAST_LISTED or not len(heard) or not known or ("sensitivity_db" in arrays and level is None):
+    if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return
     moment = moments(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
@@ -170,7 +204,7 @@ def _with_unlisted(check: Checker, stations: Stations, static: End) -> None:
     if not lists.recognised():
         return
     # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
-    floor = np.broadcast_to(levels[heard].min() if level is None else level, count)
+    floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
     of_list, station, below = lists.unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
@@ -189,7 +223,7 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
         if array.shape[:2] == (rows, count):
             wide[name] = array.reshape(rows * count, *array.shape[2:])
     other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
-    return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows, count) | wide)
+    return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows) | wide)
 
 
 def _without_fix(check: Checker, measured: str) -> None:
@@ -272,8 +306,7 @@ def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndar
 def _valid(check: Checker, measured: str, links: Links) -> Links | None:
     """Rows without a missing value; censored ones hold the level that they lie below or above, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
-    count = 1 if links.stations is None else len(links.stations)
-    level = check.real("sensitivity_db", (), (count,), values.shape[:1])
+    level = check.real("sensitivity_db", (), (1,), values.shape[:1])
     if "sensitivity_db" in arrays and level is None:
         return None
     saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
@@ -282,9 +315,7 @@ def _valid(check: Checker, measured: str, links: Links) -> Links | None:
             return check.refuse(name, f"goes with rssi_db, not with {measured}")
     floor = None
     if level is not None and values.ndim == 1:
-        # Limits of rows and of stations look alike where the counts agree: then they are of stations.
-        of_stations = level.shape == (count,) and count > 1
-        floor = np.broadcast_to(level[arrays["station"]] if of_stations else level, values.shape)
+        floor = np.broadcast_to(level, values.shape)
         floor = np.where(np.isnan(floor) & np.isfinite(values), values, floor)  # what was heard needs none
         if not (np.abs(floor) <= 400).all():
             return check.refuse("sensitivity_db", "expected dB between -400 and 400")
@@ -338,31 +369,15 @@ def _valid(check: Checker, measured: str, links: Links) -> Links | None:
         why = "nothing was heard in any row" if censored.any() else "nothing was measured"
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
-        _note_lost(check, measured, links.stations, keep, censored)
+        none = " or without any power" if measured == "spectrum" else ""
+        for flags, what in ((~keep, f"values are missing{none}"), (censored, NOT_HEARD)):
+            check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
         check.raw = replace(check.raw, arrays=arrays)
     if not side.any():
         return links
     arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
     return replace(links, censored=side)
-
-
-def _note_lost(
-    check: Checker, measured: str, stations: Stations | None, keep: np.ndarray, censored: np.ndarray
-) -> None:
-    """How many links have no value, and how many were not heard, by station."""
-    if not keep.all():
-        silent = " or without any power" if measured == "spectrum" else ""
-        text = f"{int((~keep).sum())} of {len(keep)} values are missing{silent}"
-        if stations is not None:
-            lost = np.bincount(check.raw.arrays["station"][~keep], minlength=len(stations))
-            most = [f"{stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i]]
-            text += f" (most: {', '.join(most)})"
-        weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
-        check.notes.append(text + weak)
-    if censored.any():
-        count = int(censored.sum())
-        check.notes.append(f"{count} of {len(keep)} powers were not heard: below sensitivity_db")
 
 
 def _heights(check: Checker) -> bool:
@@ -386,13 +401,6 @@ def _heights(check: Checker) -> bool:
         arrays[name] = np.concatenate([place, column], axis=-1)
         arrays.pop(height)
     return len(check.problems) == before
-
-
-def _number_runs(check: Checker, rows: int) -> None:
-    """Number the run of each row, (S,) int64; runs may have names."""
-    runs = check.array("run", (rows,))
-    if runs is not None:
-        check.raw.arrays["run"] = np.unique(runs, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def in_metres(check: Checker) -> Georeference | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -128,26 +129,18 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 
 
-def by_carrier(
-    check: Checker, stations: Stations, carriers: np.ndarray | None, rows: int, hopping: bool
-) -> Stations:
+def by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stations:
     """Part stations at several carriers, one for each; where `hopping`, carriers of a band are one."""
     arrays = check.raw.arrays
-    if carriers is None or carriers.ndim == 0:
+    carrier = arrays.get("carrier_hz")
+    if carrier is None or carrier.ndim == 0:
         return stations
-    wrong = ~((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ))
+    wrong = ~((carrier >= LOWEST_HZ) & (carrier <= HIGHEST_HZ))
     if wrong.any():
-        check.refuse("carrier_hz", f"{carriers[np.argmax(wrong)]:g}; expected Hz (not MHz or GHz)")
+        check.refuse("carrier_hz", f"{carrier[np.argmax(wrong)]:g}; expected Hz (not MHz or GHz)")
         check.problems.raise_if_any()
-    station, count = arrays["station"], len(stations)
-    of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, count)
-    if len(carriers) == count != rows:
-        of_link = carriers[station]
-    elif len(carriers) == count and len(np.unique(carriers)) > 1:
-        said = "as many values as rows and as stations; taken as one for each row"
-        check.notes.append(f"carrier_hz: {said}")
-    of_link = _of_one(check, station, of_link, stations.name) if hopping else of_link
-    pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
+    carrier = _of_one(check, arrays["station"], carrier, stations.name) if hopping else carrier
+    pairs, which = np.unique(np.stack([arrays["station"], carrier], 1), axis=0, return_inverse=True)
     first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]
     arrays.pop("carrier_hz")
     if len(np.unique(carrier)) == 1:
@@ -155,9 +148,6 @@ def by_carrier(
         return stations
     several = np.bincount(first)[first] > 1  # a station of one carrier keeps its name
     called = zip(first, carrier, several, strict=True)
-    names = tuple(stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called)
-    rotation, sector = (None if one is None else one[first] for one in (stations.rotation, stations.sector))
+    names = [stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called]
     arrays["station"] = which.reshape(-1).astype(np.int64)
-    if arrays.get("sensitivity_db", np.zeros(())).shape == (count,):  # of both carriers alike
-        arrays["sensitivity_db"] = arrays["sensitivity_db"][first]
-    return Stations(stations.position[first], names, rotation, carrier, sector)
+    return replace(stations.at(first, names), carrier_hz=carrier)

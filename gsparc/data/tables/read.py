@@ -25,7 +25,6 @@ from gsparc.data.tables.opening import read_parquet, sheet_of
 from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, StationList, one_each, places, read_stations
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.tables.slots import unfolded
-from gsparc.data.tables.splitting import splitting
 
 NOTHING: Mapping[str, object] = {}
 
@@ -96,9 +95,11 @@ class Builder:
         measured = self._measurement()
         # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
+        for role in ("sensitivity_db", "frequency_hz"):
+            if role in self.chosen and len(self.chosen[role][0].value) < 2:
+                values = self._of_rows(role)
+                self.arrays |= {} if values is None else {role: values}
         self._frequency(channels="csi" in self.arrays)
-        if "sensitivity_db" in self.chosen:
-            self._one("sensitivity_db")
         for role in ("run", "row_name"):
             if role in self.chosen:
                 self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
@@ -206,8 +207,6 @@ class Builder:
             self.arrays["station_name"] = np.array(stations.names)
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
             others["station"] = stations.places
-        # Warnings need the level and the station of each row, so both are known before.
-        self._splitting(measured, where, None if stations is None else stations.index)
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
@@ -219,37 +218,19 @@ class Builder:
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
-    def _unused(self) -> dict[str, np.ndarray]:
-        """Text (S,) of the columns that are not used, those of one value left out."""
-        used = {column.head for columns in self.chosen.values() for column in columns}
-        # A column of one value tells nothing apart, whatever it is called.
-        words = {head: self.sheet.words(head) for head in self.sheet.heads if head not in used}
-        return {head: text for head, text in words.items() if (text != text[0]).any()}
-
     def _zones(self, where: Places) -> str:
         """Head of a column that tells two groups of places far apart from each other; empty without."""
         groups = None if where.degrees else two_groups(where.across)
         if groups is None:
             return ""
-        for head, words in self._unused().items():
+        used = {column.head for columns in self.chosen.values() for column in columns}
+        for head in [head for head in self.sheet.heads if head not in used]:
+            words = self.sheet.words(head)
             values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
             # A tenth of the rows: columns with more values number rows or times rather than places.
             if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
                 return head
         return ""
-
-    def _splitting(self, measured: str | None, where: Places, station: np.ndarray | None) -> None:
-        """Warn of unused columns whose groups have levels or places of their own within one station."""
-        if measured not in LEVELS or self.arrays[measured].ndim > 1:
-            return
-        level = self.arrays[measured]
-        station = np.zeros(len(level), int) if station is None else station
-        # A degree of longitude is shorter than one of latitude, by the cosine of the latitude.
-        stretch = np.cos(np.radians(np.nanmedian(where.across[:, 0]))) if where.degrees else 1.0
-        names = [column.head or "" for column in self.chosen.get("station", ())]
-        for head, said in splitting(where.across * [1, stretch], level, station, self._unused()):
-            how = f"dataset.columns.station={'+'.join([*names, head])} tells them apart"
-            self.notes.append(Caution(f"{said}: {how}"))
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
@@ -300,7 +281,6 @@ class Builder:
             words = plain if exact and set(plain) <= set(listed.names) else words
             self.listed = listed if words is plain else joined
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
-        self._rounded(words, head)
         if self.listed is not None:
             self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
@@ -325,14 +305,6 @@ class Builder:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
-
-    def _rounded(self, words: np.ndarray, head: str) -> None:
-        """Warn of names that a spreadsheet has rounded: several stations may have become one."""
-        # Spreadsheets keep 15 digits of a number: longer ones, like cell identities, then end in zeros.
-        lost = sorted({w for w in words.tolist() if re.fullmatch(r"\d(?:[.,]\d+)?E\+\d+|\d{15}0{2,}", w)})
-        if lost:
-            said = f"column {head!r}: {some(lost, 3)}: rounded by a spreadsheet, stations may have become one"
-            self.notes.append(Caution(f"{said}; export the column as text"))
 
     def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
         """Stations at places that nobody gave."""
@@ -430,48 +402,38 @@ class Builder:
         if where.height is None:
             self.arrays[f"{name}_height"] = np.asarray(flat)
 
-    def _one(self, role: str) -> None:
-        """Add a number for all rows."""
-        column = self.chosen[role][0]
-        values = column.numbers(self.sheet)
+    def _of_rows(self, role: str) -> np.ndarray | None:
+        """Numbers (S,) of rows, () where all are one."""
+        values = self.chosen[role][0].numbers(self.sheet)
         if values is None:
-            return
+            return None
         different = np.unique(values[~np.isnan(values)])
-        if len(different) == 1:
-            self.arrays[role] = different[0]
-        else:
-            fault = f"{len(different)} values; expected one {role} for all rows"
-            self.refuse(fault, column.head or "")
+        return different[0] if len(different) == 1 else values
 
     def _frequency(self, channels: bool) -> None:
         """Add frequencies of tones, or the carrier."""
-        if "frequency_hz" in self.chosen:
-            column = self.chosen["frequency_hz"][0]
-            if len(column.value) == 2:
-                if not channels or len(self.tones) == 1:
-                    fault = f"two frequencies {column.value} for one tone"
-                    return self.refuse(f"dataset.columns.frequency_hz: {fault}")
-                # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
-                self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], column.value)
-                if np.ptp(np.diff(self.tones)):
-                    self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
-            else:
-                self._one("frequency_hz")
+        ends = self.chosen["frequency_hz"][0].value if "frequency_hz" in self.chosen else ()
+        if len(ends) == 2:
+            if not channels or len(self.tones) == 1:
+                return self.refuse(f"dataset.columns.frequency_hz: two frequencies {ends} for one tone")
+            # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
+            self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], ends)
+            if np.ptp(np.diff(self.tones)):
+                self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
         if "carrier_hz" not in self.chosen:
             return
         column = self.chosen["carrier_hz"][0]
-        values = column.numbers(self.sheet)
+        values = self._of_rows("carrier_hz")
         if values is None:
             return
-        unknown = np.flatnonzero(np.isnan(values))
         # Stations are told apart by their carriers: a row without one would be of none.
+        unknown = np.flatnonzero(np.isnan(values))
         self.sheet.refuse_rows(column.head, unknown, "no value; expected a frequency")
         # Numbers of 100 to 1e5 without a unit are MHz in the logs of phones and scanners; GHz are below 100.
         if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
             values = 1e6 * values
             self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
-        same = len(np.unique(values)) == 1
-        self.arrays["carrier_hz"] = values[0] if same else values
+        self.arrays["carrier_hz"] = values
         # Only a single tone lies at the carrier itself.
-        if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
-            self.arrays["frequency_hz"] = values[0]
+        if channels and not np.ndim(values) and self.arrays["csi"].ndim == 1:
+            self.arrays.setdefault("frequency_hz", values)

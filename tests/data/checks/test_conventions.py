@@ -67,8 +67,6 @@ OF_CSI = {
     "zeros_unmeasured": (WIDE, lambda a: {"csi": a["csi"] * (np.arange(16) != 8)}),
     "reverse_antennas": (LONG, lambda a: {"csi": a["csi"][:, ::-1]}),
     "exchange_axes": (LONG, lambda a: {"csi": a["csi"].swapaxes(1, 2)}),
-    "exchange_array": (SQUARE,
-        lambda a: {"csi": a["csi"].reshape(ROWS, 4, 4, -1).swapaxes(1, 2).reshape(a["csi"].shape)}),
     "array_mm": (SQUARE, lambda a: {"array_position": a["array_position"] * 1000}),
     "array_wavelengths": (SQUARE,
         lambda a: {"array_position": a["array_position"] * a["frequency_hz"].mean() / LIGHT}),
@@ -120,15 +118,6 @@ def test_another_convention_of_spectra_was_good(tmp_path, name):
     data = mended_by(tmp_path, damaged, name)
     assert convention_warnings(data) == []
     assert data.target.shape == (ROWS, 18, 36)
-
-
-def test_two_conventions_at_once_are_named_together():
-    clean = channels(**SQUARE)
-    damaged = clean | {"csi": np.fft.ifftshift(clean["csi"][:, ::-1], axes=2)}
-    assert sorted(settings(convention_warnings(from_arrays(damaged)))[:2]) == [
-        "fft_order",
-        "reverse_antennas",
-    ]
 
 
 def test_what_rows_do_not_tell_apart_is_said():

@@ -5,7 +5,8 @@ import pytest
 
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
-from gsparc.data.selection import keep_stations, split_stations
+from gsparc.data.schema import Measurements
+from gsparc.data.selection import Selection
 
 
 def wide(**more: np.ndarray) -> Raw:
@@ -20,29 +21,29 @@ def wide(**more: np.ndarray) -> Raw:
     return Raw(arrays, {}, {})
 
 
-def links(raw: Raw) -> list[tuple[str, float]]:
-    """(station, power) of every row, as loaded."""
-    data = interpret(raw, "file").data
+def parted(raw: Raw, steps: dict[str, tuple[int, ...]], **settings) -> Measurements:
+    return interpret(raw, "file", Selection(level_steps=steps, **settings)).data
+
+
+def links(data: Measurements) -> list[tuple[str, float]]:
+    """(station, power) of every row."""
     level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
-    return [
-        (data.site.stations.name[t], round(float(v), 3)) for t, v in zip(data.station, level, strict=True)
-    ]
+    names = data.site.stations.name
+    return [(names[t], round(float(v), 3)) for t, v in zip(data.station, level, strict=True)]
 
 
 def test_rows_after_a_step_are_another_stations():
-    parts = links(split_stations(wide(), {"b": (5, 8)}, "file"))
+    parts = links(parted(wide(), {"b": (5, 8)}))
     names = [name for name, _ in parts]
     assert [names.count(n) for n in ("a", "b", "b from row 5", "b from row 8")] == [12, 4, 3, 4]
-    assert sorted(v for _, v in parts) == sorted(v for _, v in links(wide())), "no power came or went"
-    raw = wide()
-    assert {v for n, v in parts if n == "b from row 5"} == {
-        round(float(v), 3) for v in raw.arrays["rssi_db"][5:8, 1]
-    }
+    assert sorted(v for _, v in parts) == sorted(v for _, v in links(parted(wide(), {})))
+    after = wide().arrays["rssi_db"][5:8, 1]
+    assert [v for n, v in parts if n == "b from row 5"] == [round(float(v), 3) for v in after]
 
 
 def test_a_part_stays_censored_where_it_heard_nothing_and_only_there():
     """Columns filled up with NaN would be rows where nothing was heard."""
-    data = interpret(split_stations(wide(sensitivity_db=np.array(-90.0)), {"b": (5,)}, "file"), "file").data
+    data = parted(wide(sensitivity_db=np.array(-90.0)), {"b": (5,)})
     assert data.censored.sum() == 1 and data.site.stations.name[data.station[data.censored > 0][0]] == "b"
 
 
@@ -50,22 +51,14 @@ def test_rows_of_a_long_file_and_its_parts_by_the_stations_name():
     raw = wide()
     arrays = {k: v for k, v in raw.arrays.items() if k != "rssi_db"}
     long = Raw({**arrays, "station": np.arange(12) % 2, "rssi_db": raw.arrays["rssi_db"][:, 0]}, {}, {})
-    parts = split_stations(long, {"b": (6,)}, "file")
-    assert parts.arrays["station"].tolist() == [0, 1, 0, 1, 0, 1, 0, 2, 0, 2, 0, 2]
-    kept = keep_stations(parts, ["b"], "file").raw.arrays
-    assert kept["station_name"].tolist() == ["b", "b from row 6"] and kept["station"].tolist() == [
-        0,
-        0,
-        0,
-        1,
-        1,
-        1,
-    ]
+    assert parted(long, {"b": (6,)}).station.tolist() == [0, 1, 0, 1, 0, 1, 0, 2, 0, 2, 0, 2]
+    kept = parted(long, {"b": (6,)}, stations=["b"])
+    assert kept.site.stations.name == ("b", "b from row 6") and kept.station.tolist() == [0, 0, 0, 1, 1, 1]
 
 
 def test_places_of_a_row_are_held_out_together_as_before():
-    before, after = (interpret(r, "file").data for r in (wide(), split_stations(wide(), {"b": (5,)}, "file")))
-    assert np.array_equal(np.unique(before.place), np.unique(after.place)) and len(before) == len(after)
+    before, after = parted(wide(), {}), parted(wide(), {"b": (5,)})
+    assert np.array_equal(before.place, after.place) and len(before) == len(after)
 
 
 def unplaced() -> Raw:
@@ -79,9 +72,9 @@ def unplaced() -> Raw:
     (unplaced, {"b": (2,)}, "has no stations"),
 ])  # fmt: skip
 def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
-    refused(says, split_stations, make(), steps, "file")
+    refused(says, parted, make(), steps)
 
 
 def test_a_station_with_a_name_was_unknown_by_its_number():
-    by_name, by_number = (split_stations(wide(), {who: (5,)}, "file").arrays for who in ("b", "1"))
-    assert by_name["station_name"].tolist() == by_number["station_name"].tolist()
+    by_name, by_number = (parted(wide(), {who: (5,)}).site.stations.name for who in ("b", "1"))
+    assert by_name == by_number
