@@ -1,5 +1,6 @@
 """Small invented campaigns, and the real subset where it is present."""
 
+import gc
 import shutil
 from collections.abc import Callable
 from copy import deepcopy
@@ -20,6 +21,17 @@ from gsparc.data.splits import Split
 from gsparc.prediction.timing import ClockSettings
 
 threadpool_limits(1, "blas")  # as every command has it
+
+
+def pytest_collection():
+    """A quarter of the collection went into looking for circles among what stays."""
+    gc.disable()
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
