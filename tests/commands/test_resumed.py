@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from campaigns import STILL, brief, channels, compose, plain, short, spectra, weights
+from campaigns import FROZEN, brief, channels, compose, plain, short, spectra, weights
 from doors import assert_refused, knock
 from lightning.pytorch import Trainer
 
@@ -133,7 +133,7 @@ def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway,
     new = spectra(tmp_path / "new.npz", rows=55)
     before = weights(halfway.checkpoints[0])
     after = {}
-    for name, more in {"still": STILL, "on": ()}.items():
+    for name, more in {"still": FROZEN, "on": ()}.items():
         config = short(new, f"init_from='{halfway.checkpoints[0]}'", "trainer.max_steps=1", *more)
         _, objects = train(config, tmp_path / name)
         after[name] = weights(objects.checkpoints[0])

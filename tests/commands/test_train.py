@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigns import STILL, brief, channels, compose, plain, powers, short, spectra, weights
+from campaigns import FROZEN, brief, channels, compose, plain, powers, short, spectra, weights
 from doors import knock
 from lightning.pytorch import Trainer
 from omegaconf import open_dict
@@ -202,7 +202,7 @@ def test_two_devices_learn_what_one_does(spectra_file, halfway, tmp_path):
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     facts, objects = train(short(spectra_file, *two), tmp_path)
     assert steps(tmp_path) == [10, 20] and facts["time/train_s"] > 0  # written by one of them
-    _, untouched = train(short(spectra_file, "trainer.max_steps=1", *STILL), tmp_path / "start")
+    _, untouched = train(short(spectra_file, "trainer.max_steps=1", *FROZEN), tmp_path / "start")
     one, both, began = (weights(o.checkpoints[0])["gaussians.means"] for o in (halfway, objects, untouched))
     assert (both - one).norm() < 0.2 * (one - began).norm()  # the same mean gradient, but for rounding
 

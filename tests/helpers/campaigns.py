@@ -110,8 +110,8 @@ def plain(file: Path, model: str, *more: str):
     return compose(*(s for s in brief(file) if not s.startswith("model.")), f"model={model}", *more)
 
 
-STILL = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
-         "opacities", "emission", "confidence", "gain")]  # no weight moves  # fmt: skip
+FROZEN = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
+          "opacities", "emission", "confidence", "gain")]  # no weight moves  # fmt: skip
 
 
 def weights(path: Path) -> dict:
