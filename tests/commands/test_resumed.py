@@ -197,26 +197,13 @@ def test_a_method_without_a_field_has_no_module(others):
         module_of(others["nearest"])
 
 
-def test_an_interrupt_leaves_a_checkpoint_that_goes_on(spectra_file, tmp_path):
-    rare = "model.refit=false", "trainer.val_check_interval=50000"
-    often = "callbacks.checkpoint.interval=10"
-    stopped = "+callbacks.stop={_target_: lost.Interrupt, step: 15}", f"hydra.run.dir={tmp_path / 'run'}"
-    answer = knock(main, "train.py", brief(spectra_file, *rare, often, *stopped))
-    last = tmp_path / "run" / "last.ckpt"
-    assert answer.status == 130 and answer.err[-1].endswith(f"go on with ckpt_path={last}"), answer
-    assert not any("Traceback" in line for line in answer.err)
-    reached = checkpoint.read(last).extra["trainer"]["global_step"]
-    more = f"trainer.max_steps={reached + 5}", f"ckpt_path={last}"
-    facts, _ = train(compose(*brief(spectra_file, *rare, *more)), tmp_path / "on")
-    assert np.isfinite(facts["test/psnr_db"])
-    assert checkpoint.read(tmp_path / "on" / "model.ckpt").method == "gsparc"
-
-
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     """The settings it did not name were the defaults, and each of them stood in the refusal."""
     stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"
     begun = brief(spectra_file, "model.refit=false", f"+{stopped}", f"hydra.run.dir={tmp_path / 'run'}")
-    assert knock(main, "train.py", begun).status == 130
+    answer, last = knock(main, "train.py", begun), tmp_path / "run" / "last.ckpt"
+    assert answer.status == 130 and answer.err[-1].endswith(f"go on with ckpt_path={last}"), answer
+    assert not any("Traceback" in line for line in answer.err)
     on = f"ckpt_path={tmp_path / 'run'}", f"hydra.run.dir={tmp_path / 'on'}"
     others = [f"model.emission.{name}=0.5" for name in ("init_scale", "init_bias")] + ["seed=3"]
     others += [f"model.effects.{name}=auto" for name in ("array", "phase", "power", "residual")]
