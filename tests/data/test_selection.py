@@ -9,14 +9,7 @@ from releases import real
 from gsparc.data import selection
 from gsparc.data.own import from_arrays
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.selection import (
-    Selection,
-    keep_above,
-    keep_rows,
-    keep_runs,
-    keep_stations,
-    select,
-)
+from gsparc.data.selection import Selection, keep_above, keep_rows, keep_runs, keep_stations, select
 
 
 def wide() -> Raw:
