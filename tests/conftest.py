@@ -27,7 +27,7 @@ def pytest_collection():
 
 def pytest_collection_finish():
     gc.freeze()
-    gc.set_threshold(20_000, 10, 10)
+    gc.set_threshold(5_000, 10, 10)
     gc.enable()
 
 
