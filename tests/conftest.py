@@ -1,30 +1,46 @@
-"""Small invented campaigns, and the real subset where it is present."""
+"""Small invented campaigns, and the real subset where it is present.
 
+What is large is imported where it is needed: pytest-xdist starts its workers after it has read this file.
+"""
+
+from __future__ import annotations
+
+import gc
 import shutil
 from collections.abc import Callable
 from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-import torch
-from hydra.core.plugins import Plugins
-from invented import divide, invent
-from PIL import Image
-from releases import real
-from threadpoolctl import threadpool_limits
 
-from gsparc.data import executor
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split
-from gsparc.prediction.timing import ClockSettings
+if TYPE_CHECKING:
+    from gsparc.data.schema import Measurements
+    from gsparc.data.splits import Split
 
-threadpool_limits(1, "blas")  # as every command has it
+
+def pytest_collection():
+    """A quarter of the collection went into looking for circles among what stays."""
+    gc.disable()
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.set_threshold(5_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
     """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
+    from hydra.core.plugins import Plugins
+    from PIL import Image
+    from threadpoolctl import threadpool_limits
+
+    from gsparc.prediction.timing import ClockSettings
+
+    threadpool_limits(1, "blas")  # as every command has it
     Plugins.instance()  # which imports the class anew
     found = import_module("hydra._internal.core_plugins.importlib_resources_config_source")
     read, known = found.ImportlibResourcesConfigSource._read_config, {}
@@ -50,30 +66,42 @@ def _short_trainings_end_at_once():
 @pytest.fixture(scope="session")
 def real_rfid() -> Path:
     """Folder of the real subset."""
+    from releases import real
+
     return real("rfid-s23-160")
 
 
 @pytest.fixture(scope="session")
 def real_newrf() -> Path:
     """File of the conference room."""
+    from releases import real
+
     return real("newrf-conference.npz")
 
 
 @pytest.fixture(scope="session")
 def campaign() -> Callable[..., Measurements]:
     """`campaign(kind, rows, static_end, seed)`: an invented dataset."""
+    from invented import invent
+
     return invent
 
 
 @pytest.fixture(scope="session")
 def folds() -> Callable[..., Split]:
     """`folds(rows, folds)`: a split of it."""
+    from invented import divide
+
     return divide
 
 
 @pytest.fixture
 def elsewhere():
     """`elsewhere("joblib")`, `elsewhere("ray", nodes=2)`: other processes do pieces of work until the end."""
+    import torch
+
+    from gsparc.data import executor
+
     cluster, threads = None, torch.get_num_threads()
 
     def use(engine: str, nodes: int = 2):

@@ -101,7 +101,7 @@ def arrows() -> dict[tuple[str, str], set[str]]:
     """Which room imports which, and the files that do."""
     found = defaultdict(set)
     for room, file in FILES:
-        for name in (*_imports(file), *named(_tree(file))):
+        for name in _needs(file):
             used = room_of(name)
             if used not in (None, room):
                 found[room, used].add(file.relative_to(ROOT).as_posix())
@@ -172,7 +172,7 @@ def test_the_core_does_without_the_apps():
     rooms = [ROOT / name for name in ("gsparc", "ops", "callbacks", "bench", "hydra_plugins")]
     core = [file for room in rooms for file in room.rglob("*.py") if not {*above} & {*file.parents}]
     assert len(core) > 300
-    wrong = {file for file in core for name in (*_imports(file), *named(_tree(file))) if _is_app(name)}
+    wrong = {file for file in core for name in _needs(file) if _is_app(name)}
     wrong |= {file for file in (ROOT / "conf").rglob("*.yaml") if "gsparc.apps" in file.read_text("utf-8")}
     assert not wrong
 
@@ -201,6 +201,11 @@ def test_only_the_viewers_server_imports_viser():
 @cache
 def _imports(file: Path) -> tuple[str, ...]:
     return tuple(imported(_tree(file)))
+
+
+@cache
+def _needs(file: Path) -> frozenset[str]:
+    return frozenset((*_imports(file), *named(_tree(file))))
 
 
 @cache

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from campaigns import brief, compose, spectra
+from campaigns import brief, compose, plain, spectra
 
 from gsparc.commands.calibrate import tables
 from gsparc.commands.evaluate import evaluate_files
@@ -187,8 +187,7 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
 
 def _trained(folder, *more: str, run: str = "run"):
     """The nearest neighbour of forty spectra."""
-    settings = brief(spectra(folder / "own.npz"), "model=nearest", *more)
-    return train(compose(*(s for s in settings if not s.startswith("model."))), folder / run)[1]
+    return train(plain(spectra(folder / "own.npz"), "nearest", *more), folder / run)[1]
 
 
 def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_path) -> None:

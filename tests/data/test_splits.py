@@ -103,17 +103,6 @@ def test_thinned_training_sets_are_nested_and_share_the_test_set():
     np.testing.assert_array_equal(test, test_few)
 
 
-def test_index_file_round_trip(tmp_path):
-    split = make_split(_walk(), SplitSettings("grouped"))
-    path = tmp_path / "run" / "split.json"
-    write_split(path, split, rows=400, dataset_sha256="abc")
-    read = read_split(path, rows=400, dataset_sha256="abc")
-    assert read.sha256 == split.sha256 and read.name == "grouped"
-    for ours, theirs in zip(read.folds, split.folds, strict=True):
-        np.testing.assert_array_equal(ours.train, theirs.train)
-        assert ours.test.dtype == np.int64
-
-
 def test_index_file_for_other_data_warns(tmp_path, caplog):
     path = tmp_path / "split.json"
     write_split(path, make_split(_walk(), SplitSettings()), rows=400, dataset_sha256="abc")

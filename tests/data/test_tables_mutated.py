@@ -1,4 +1,4 @@
-"""Two hundred correct tables, each with one thing changed: it loads right, or is refused in a line.
+"""A hundred correct tables, each with one thing changed: it loads right, or is refused in a line.
 
 Not among the changes is what no reader can see: another digit, x and y swapped in a room, a sign in one row,
 another name where nothing lists the names.
@@ -318,7 +318,7 @@ def same(one: Measurements, other: Measurements) -> bool:
 def test_a_table_with_one_thing_changed_loads_right_or_is_refused(tmp_path):
     came: Counter[tuple[str, str]] = Counter()
     rng = np.random.default_rng(39)
-    for number in range(200):
+    for number in range(100):
         change, made = CHANGES[number % len(CHANGES)], None
         while made is None:
             drive = draw(rng)
@@ -335,4 +335,4 @@ def test_a_table_with_one_thing_changed_loads_right_or_is_refused(tmp_path):
             assert made[1] != REFUSED, where + "was not refused"
             assert same(whole, found), where + "was read as something else"
             came[change.__name__, SAME] += 1
-    assert sum(count for (_, what), count in came.items() if what == SAME) >= 70, came
+    assert sum(count for (_, what), count in came.items() if what == SAME) >= 35, came

@@ -5,11 +5,9 @@ file (gsparc/models/checkpoint.py, gsparc/data/raw.py). Shown with a limit on th
 fails like a full disk does: in the middle of writing.
 """
 
-import errno
 from pathlib import Path
 
 import pytest
-import torch
 from crashes import Limited, run, simulation
 
 from gsparc.models import checkpoint
@@ -40,16 +38,6 @@ def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(fitted, tmp_path):
     ):
         checkpoint.save(path, fitted)
     assert "\n" not in str(e.value) and path.read_bytes() == before and left(tmp_path) == names
-
-
-def test_no_space_is_said_so(fitted, tmp_path, monkeypatch):
-    def full(*unused, **named):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(CheckpointError, match=r"m\.ckpt: cannot be written \(No space left on device\)"):
-        checkpoint.save(tmp_path / "m.ckpt", fitted)
-    assert left(tmp_path) == []
 
 
 @pytest.mark.slow

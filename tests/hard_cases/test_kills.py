@@ -46,9 +46,8 @@ def sooner(folder: Path):
         yield here, 0.4**attempt
 
 
-CHAINS = pytest.mark.parametrize(
-    "chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
-)
+pytestmark = pytest.mark.slow  # at once: tests/commands/test_resumed.py, tests/simulate/test_campaign.py
+CHAINS = pytest.mark.parametrize("chain", [0, 1, 2])
 
 
 @CHAINS

@@ -98,3 +98,24 @@ def brief(file: Path, *more: str) -> list[str]:
         "threads=1",
         *more,
     ]
+
+
+def short(file: Path, *more: str):
+    """The configuration of a training of a second whose model may go on."""
+    return compose(*brief(file, "model.refit=false", *more))
+
+
+def plain(file: Path, model: str, *more: str):
+    """The configuration of a method without a gradient."""
+    return compose(*(s for s in brief(file) if not s.startswith("model.")), f"model={model}", *more)
+
+
+FROZEN = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
+          "opacities", "emission", "confidence", "gain")]  # no weight moves  # fmt: skip
+
+
+def weights(path: Path) -> dict:
+    """Those of the field that a checkpoint holds."""
+    from gsparc.models import checkpoint
+
+    return checkpoint.read(path).state["inner"]["model"]

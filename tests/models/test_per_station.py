@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from posts import POSTS, distances, free_space, heard, walked
-from releases import REAL
 from scenes import fold_of
 
 import gsparc
@@ -116,27 +115,6 @@ def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     assert for_stations(method_class("idw")(), data).both_ends
     with pytest.raises(ValueError, match="both ends move here"):
         for_stations(method_class("array")(), data)
-
-
-def test_real_city(tmp_path):
-    file = REAL / "real" / "powder-rss-462mhz.npz"
-    if not file.is_file():
-        pytest.skip(f"{file.name} is not here")
-    with np.load(file) as stored:
-        data = from_arrays(
-            {
-                "tx_position": stored["mobile_position"], "tx_height": np.array(1.5),
-                "station_position": stored["station_position"], "station_height": np.array(10.0),
-                "station_name": stored["station"], "rssi_db": stored["rssi_db"],
-            }
-        )  # fmt: skip
-    split = split_for({"name": "blocks", "side_m": 300.0}, data)
-    contexts = in_folders(FitContext(tmp_path), split)
-    found = {
-        name: fit_folds(method_class(name)(), data, split, contexts).scored_on(data, split).figures
-        for name in ("mean", "idw")
-    }
-    assert 9 < found["mean"]["rmse_db"] < 11 and 6 < found["idw"]["rmse_db"] < 8
 
 
 def test_a_station_that_heard_nothing_ended_the_run():

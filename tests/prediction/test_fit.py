@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from campaigns import brief, compose
+from campaigns import plain
 
 import gsparc
 from gsparc.commands.train import train
@@ -34,8 +34,7 @@ def test_arrays_of_every_kind_become_a_predictor_that_is_stored(kind, model, tmp
 
 def test_it_is_the_model_that_the_command_trains(tmp_path):
     np.savez(tmp_path / "own.npz", rx_position=PLACES, tx_position=END, rssi_db=POWERS)
-    settings = [one for one in brief(tmp_path / "own.npz") if not one.startswith("model.")]
-    _, objects = train(compose(*settings, "model=gp"), tmp_path / "run")
+    _, objects = train(plain(tmp_path / "own.npz", "gp"), tmp_path / "run")
     fold = objects.split.folds[0]
     known = np.sort(np.concatenate([fold.train, fold.val]))
     found = gsparc.fit(rx=PLACES[known], tx=END, rssi=POWERS[known], model="gp")

@@ -271,7 +271,7 @@ def test_the_stated_error_missed_the_metres_under_a_station():
     predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
     found = make.compiled(predictor, 1024)
     assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
-    places = make.random_places(predictor.site, 20_000, 9)
+    places = make.random_places(predictor.site, 6_000, 9)
     own, whole = (make.answers(one, places)[:, 0] for one in (found.form.predictor, predictor))
     apart = 10 * np.log10(own / whole)
     assert found.error == pytest.approx(np.sqrt(np.mean(apart**2)), rel=0.1)

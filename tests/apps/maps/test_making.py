@@ -12,15 +12,7 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.apps.maps.field_map import (
-    ARRAYS,
-    REFUSED,
-    best_server,
-    loads,
-    overlapping,
-    server_chance,
-    sinr,
-)
+from gsparc.apps.maps.field_map import ARRAYS, REFUSED, best_server, loads, overlapping, server_chance, sinr
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import _usual, answering, levels_at, map_of
 from gsparc.apps.maps.pictures import Layer, Legend, layers, named_areas, shades

@@ -73,8 +73,7 @@ def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "rows",
-    ["outlier", "", [-1], [1.5], [999], 3, None, True, [True], [[3]], {"3": 4}, [10**20], np.array(3)],
+    "rows", ["outlier", "", [-1], [1.5], [999], 3, None, True, [True], [[3]], {"3": 4}, [10**20], np.array(3)]
 )
 def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path):
     """A single number, null and a number beyond 64 bits ended in words of Python and NumPy."""

@@ -169,11 +169,7 @@ DRAWN = np.random.default_rng(57).permutation(len(NOTED))[:10]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case, option",
-    [NOTED[i] for i in DRAWN],
-    ids=name_of,
-)
+@pytest.mark.parametrize("case, option", [NOTED[i] for i in DRAWN], ids=name_of)
 def test_what_is_named_changes_no_bit_of_the_answers(case, option):
     assert torch.equal(*perturbed(case, option))
 

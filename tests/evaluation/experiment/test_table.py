@@ -8,14 +8,7 @@ from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.experiment.pictures import draw_budgets
-from gsparc.evaluation.experiment.table import (
-    blocks_of,
-    cells_of,
-    markdown,
-    remarks,
-    rows_of,
-    title_of,
-)
+from gsparc.evaluation.experiment.table import blocks_of, cells_of, markdown, remarks, rows_of, title_of
 
 
 def filled(method, value, seed=None, budget=None, split="random", kind="spectrum", **more):

@@ -208,7 +208,7 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
 
 @pytest.mark.slow
 def test_visibility_behind_a_pillar_is_learned(tmp_path):
-    told, data, fold = shoebox(450, pillar=True)
+    told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1, pillar=True)
     method = ImageSourceGP(searches=1)
     method.fit(data, fold, FitContext(tmp_path))
     assert error(method, data, fold.test) <= 0.02
