@@ -48,12 +48,9 @@ class ErrorCovariance:
 
 
 def unknown_of(
-    predictor: Predictor,
-    places: np.ndarray,
-    stations: Sequence[str],
-    promise: Promise | None,
+    predictor: Predictor, places: np.ndarray, stations: Sequence[str], promise: Promise | None,
     other_end: Sequence[float] | None = None,
-) -> list[ErrorCovariance]:
+) -> list[ErrorCovariance]:  # fmt: skip
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
     Held-out blocks of `promise` scale the variances.
@@ -67,10 +64,8 @@ def unknown_of(
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
         known = asking.covariance(**ends_of(asking.site, places, other_end))
         if known is None:
-            name = asking.method.name
-            raise DataError(
-                f"{name} states no covariance of its errors; plan with model=gp or gsparc of powers"
-            )
+            fault = "states no covariance of its errors; plan with model=gp or gsparc of powers"
+            raise DataError(f"{asking.method.name} {fault}")
         covariance, noise = known
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance

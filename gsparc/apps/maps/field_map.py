@@ -48,6 +48,7 @@ class FieldMap:
         unit: of all levels.
         azimuth: (T,) that sectors face [deg from north], NaN of others.
         bands: (T,) carriers of the stations; () of one.
+        site: (T,) int64 of the stations.
     """
 
     grid: Grid
@@ -70,6 +71,7 @@ class FieldMap:
     unit: str = "dB"
     azimuth: np.ndarray = field(default_factory=lambda: np.zeros(0))
     bands: tuple[str, ...] = ()
+    site: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def refused(self) -> np.ndarray:
@@ -179,7 +181,7 @@ def server_chance(
     left, total = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), np.zeros(len(number))
     above = ndtr((mean - floor_db[first]) / spread)
     for share in (np.arange(NODES) + 0.5) / NODES:
-        z = ndtri(1 - above * share)  # equally likely levels above the floor
+        z = ndtri(1 - np.maximum(above, 1e-12) * share)  # equally likely levels above the floor
         beats = ndtr((mean + spread * z - rival - alike * wrong * z) / left)
         beats[first, cell] = 1.0
         # A station that nothing is known of anywhere is left out: it counts as beaten.

@@ -25,6 +25,7 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
+from gsparc.models.powers.together.network import sites_of
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -144,7 +145,7 @@ def map_of(
         grid, tuple(names), **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=extra, bands=bands,
         places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
-        azimuth=azimuths_of(site, numbers), unit=site.level_unit,
+        azimuth=azimuths_of(site, numbers), unit=site.level_unit, site=_sites(site, numbers),
     ).raised(level.raised_db, level.name)  # fmt: skip
 
 
@@ -155,11 +156,9 @@ def own_deviations(share: float) -> Calibration:
 
 
 def answering(
-    predictor: Predictor,
-    wanted: Sequence[str | int] | None,
-    promise: Promise | None = None,
+    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None,
     key: str = "stations",
-) -> tuple[list[str], list[str]]:
+) -> tuple[list[str], list[str]]:  # fmt: skip
     """Names of the stations that are mapped, and notes on the others.
 
     Those are stations that the model does not answer for, and, where something is promised, stations that it
@@ -234,10 +233,7 @@ def _asker(
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        levels, parts = (
-            np.zeros((len(cells), 3 * len(numbers) if joint else 2)),
-            _chunks(cells, CHUNK),
-        )
+        levels, parts = np.zeros((len(cells), 3 * len(numbers) if joint else 2)), _chunks(cells, CHUNK)
         for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
             levels[number * CHUNK : number * CHUNK + len(values)] = values
         return levels
@@ -246,11 +242,9 @@ def _asker(
 
 
 def levels_at(
-    predictor: Predictor,
-    places: np.ndarray,
-    other: Sequence[float] | None = None,
+    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None,
     station: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
     parts = []
     for part in _chunks(places, CHUNK):
@@ -339,6 +333,12 @@ def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
     """Directions (T,) that sectors face [deg from north], NaN of what is none."""
     sector = None if site.stations is None else site.stations.sector
     return np.full(len(numbers), np.nan) if sector is None else sector[numbers, 0]
+
+
+def _sites(site: Site, numbers: np.ndarray) -> np.ndarray:
+    """Numbers (T,) of the sites that stations belong to."""
+    stations = site.stations
+    return np.zeros(1, np.int64) if stations is None else sites_of(stations, stations.position)[numbers]
 
 
 def _still(site: Site, names: Sequence[str]) -> np.ndarray:

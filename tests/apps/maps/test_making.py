@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from campaigns import channels
+from matplotlib.colors import rgb_to_hsv, to_rgb
 from scipy.stats import norm
 from towns import MASTS, town_model
 
@@ -171,6 +172,11 @@ def test_twenty_one_stations_had_twenty_colours():
     words = tuple(f"cell {i}" for i in range(24))
     table = Layer("best_server", classes, Legend("", -0.5, 23.5), words).table()
     assert len(table) == 24 and len(np.unique(table, axis=0)) <= 10
+    layer = Layer("best_server", classes, Legend("", -0.5, 23.5), words, group=np.arange(24) // 3)
+    hue = [rgb_to_hsv(to_rgb(colour))[0] for colour in layer.table()]
+    listed = layer.listed()
+    assert np.ptp(np.reshape(hue, (8, 3)), axis=1).max() < 0.02 and len(set(listed["colour"])) == 24
+    assert sum(listed["share"]) == pytest.approx(1, abs=2e-3) and listed["station"][0] == "cell 0"
     named = list(named_areas(classes, words))
     assert [word for _, _, word in named] == list(words)
     assert all(classes[row, column] == words.index(word) for row, column, word in named)
