@@ -16,8 +16,12 @@ from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_stations
+from gsparc.models.powers.together.field import JointPowerField
+from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.network import network_of
+from gsparc.models.powers.together.terms import Terms, link_rows
 from gsparc.ops import Pose
+from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, SectorKernel, Sectors
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
@@ -152,6 +156,20 @@ def test_the_pattern_of_a_sector():
     ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
     assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
+
+
+def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
+    one = network(1, moments=60, asked=20)
+    data, rows = one.data(6), np.arange(360)
+    known = network_of(data)
+    trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
+    own = Own(Prior(SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0), trend), {})
+    terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
+    field.condition(data, rows)
+    around = Pose(places(0, 0, 90, 180, 270)[:, :3] + 3000, torch.eye(3).expand(4, 3, 3).double())
+    said = field.predict(Query(torch.full((4, 3), 3000.0).double(), around)).mean.log10()
+    assert float(said.max() - said.min()) < 1e-6
 
 
 def test_sectors_of_a_site_share_shadowing():
