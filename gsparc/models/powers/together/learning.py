@@ -21,7 +21,7 @@ from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import conditioned
+from gsparc.processes.powers import LEAST_SILENT, conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
 from gsparc.processes.trend import Trend
@@ -90,7 +90,9 @@ class Own:
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
-                known = conditioned(part, Prior(prior.kernel, wide), seed)[0].posterior  # type: ignore[arg-type]
+                # Each sector of a site has a level of its own, which its silent rows bound.
+                least = LEAST_SILENT * len(np.unique(part.places[:, 6:], axis=0))
+                known = conditioned(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
