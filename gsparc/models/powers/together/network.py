@@ -182,7 +182,7 @@ def _turned(
         part = rows.at(np.flatnonzero(rows.places[:, 6] == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
             continue
-        own = torch.nn.functional.pad(TURNS.double()[:, None], (0, 2))  # neither tilted nor wider
+        own = torch.nn.functional.pad(TURNS.double()[:, None], (0, 3))  # all else as it is
         mean = trend.at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
         levels = (gains[t] + GAINS)[:, None]
         likely = _misfit(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
