@@ -8,7 +8,6 @@ matrices worth several threads go to torch.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -167,16 +166,12 @@ def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> lis
     """
     if followed(*values) or max(len(one.lower) for one in factors) > ALONE:
         return [one.whitened(part) for one, part in zip(factors, values, strict=True)]
-
-    def one(factor: Factor, part: np.ndarray) -> np.ndarray:
-        return np.concatenate([band @ part[: band.shape[1]] for band in factor._rounded])
-
-    single = [part.float().numpy() for part in values]
-    threads = min(torch.get_num_threads(), len(factors))
-    # OpenBLAS multiplies few columns in a third of torch's time, and lets go of Python meanwhile.
-    with BLAS.limit(limits=1), ThreadPoolExecutor(threads) as pool:
-        result = pool.map(one, factors, single) if threads > 1 else map(one, factors, single)
-        return [torch.from_numpy(part).to(values[0].dtype) for part in result]
+    single, result = [part.float().numpy() for part in values], []
+    # OpenBLAS multiplies few columns in a third of torch's time.
+    with BLAS.limit(limits=1):
+        for one, part in zip(factors, single, strict=True):
+            result.append(np.concatenate([band @ part[: band.shape[1]] for band in one._rounded]))
+    return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 
 
 def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
