@@ -237,7 +237,7 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     for colour, word in [*zip(listed["colour"], listed["station"], strict=True)][:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
     if len(listed["number"]) > MOST_COLOURS:
-        axis.plot([], [], "", label=f"all {len(listed['number'])}: {file_name(layer, '.csv')}")
+        axis.plot([], [], " ", label=f"all {len(listed['number'])}: {file_name(layer, '.csv')}")
 
 
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
