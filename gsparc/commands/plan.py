@@ -47,6 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     before += "" if predictor is None or predictor.site.stations is None else " of all stations"
     if plan.walk:
-        before += f", {plan.length_m:.4g} m from one to the next in this order"
+        kind = "walk" if config.walkable is None else "drive"
+        before += f", a {kind} of {plan.length_m:.4g} m, straight from place to place"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
     return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")
