@@ -134,4 +134,4 @@ def logarithmic(axes: Any, fine: bool | None = None) -> None:
 def save(figure: Figure, path: Path, dpi: float = 110) -> None:
     """Write a figure in the format of the file's ending (PNG, PDF, SVG), atomically."""
     with whole_file(path) as partial:
-        figure.savefig(partial, dpi=dpi, format=path.suffix[1:].lower())
+        figure.savefig(partial, dpi=dpi, format=path.suffix[1:].lower() or "png")

@@ -158,7 +158,8 @@ def test_the_pattern_of_a_sector():
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
 
 
-def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
+def given_settings() -> JointPowerField:
+    """A network's field whose settings nobody learned."""
     one = network(1, moments=60, asked=20)
     data, rows = one.data(6), np.arange(360)
     known = network_of(data)
@@ -167,6 +168,27 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
     terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
     field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
+    return field
+
+
+def test_slopes_of_all_cells_at_one_place_are_exact():
+    """Single queries are answered in float32, whose steps are larger than a slope's error."""
+    field, turn = given_settings(), torch.eye(3).expand(30, 3, 3).double()
+    still, number = torch.zeros(30, 3).double(), torch.arange(30)
+
+    def said(place: torch.Tensor) -> torch.Tensor:
+        found = field.predict(Query(still, Pose(place.expand(30, 3), turn), station=number))
+        return torch.cat([found.mean[:, 0].log10(), found.variance.log10()])
+
+    place, step = torch.tensor([40.0, -30, 1.5]).double(), torch.eye(3).double() * 1e-4
+    slope = torch.autograd.functional.jacobian(said, place)
+    for axis in range(3):
+        ends = (said(place + step[axis]) - said(place - step[axis])) / 2e-4
+        assert torch.allclose(slope[:, axis], ends, rtol=1e-4, atol=1e-7)
+
+
+def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
+    field = given_settings()
     around = Pose(places(0, 0, 90, 180, 270)[:, :3] + 3000, torch.eye(3).expand(4, 3, 3).double())
     said = field.predict(Query(torch.full((4, 3), 3000.0).double(), around)).mean.log10()
     assert float(said.max() - said.min()) < 1e-6
