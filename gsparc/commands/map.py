@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from fnmatch import fnmatch
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
+from gsparc.apps.maps.field_map import FieldMap, geotiff_wanted, write_geotiff
 from gsparc.apps.maps.floor_plan import plan_of
 from gsparc.apps.maps.making import map_of
 from gsparc.apps.maps.pictures import draw_layer, file_name, layers
@@ -15,8 +16,11 @@ from gsparc.apps.maps.promised import notes_of, promise_of
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
+from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.timing import peak_memory
+
+SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 
 
 def settings_of(config: DictConfig) -> RunSettings:
@@ -39,6 +43,20 @@ def stations_of(setting: Any) -> list[str | int] | None:
     return setting
 
 
+def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
+    """Patterns of the files that layers are drawn to.
+
+    Raises:
+        DataError: `save` that no layer's file matches.
+    """
+    save = [] if config.save is None else [str(config.save)]
+    names = [file_name(layer, suffix) for layer in layers(field) for suffix in SUFFIXES]
+    if save and not any(fnmatch(name, save[0]) for name in names):
+        said = ", ".join(name for name in names if name.endswith(".pdf"))
+        raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {said}")
+    return [*(["*.png"] if config.pictures else []), *save]
+
+
 def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
@@ -52,7 +70,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
     }  # fmt: skip
-    map_of(predictor, dry=True, **query)  # refuses what cannot be before any evidence is gathered
+    # Refuses what cannot be before any evidence is gathered.
+    first = map_of(predictor, dry=True, **query)
+    wanted = _pictures(config, first)
     # Refused before evidence is gathered, which takes minutes.
     geotiff_wanted(config.geotiff)
     promise = promise_of(str(config.ckpt), settings)
@@ -62,8 +82,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in layers(field) if config.pictures else ():
-        draw_layer(field, layer, run_dir / file_name(layer), title, floor)
+    for layer in layers(field):
+        for suffix in SUFFIXES:
+            name = file_name(layer, suffix)
+            if any(fnmatch(name, one) for one in wanted):
+                draw_layer(field, layer, run_dir / name, title, floor)
+        if layer.words:
+            write_samples(run_dir / file_name(layer, ".csv"), layer.listed())
     if geotiff_wanted(config.geotiff):
         write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
     facts = {

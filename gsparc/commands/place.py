@@ -7,7 +7,13 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.pictures import draw_placing
-from gsparc.apps.maps.placing import NewStation, new_station_error, place_next, unheard_stations_error
+from gsparc.apps.maps.placing import (
+    Antenna,
+    NewStation,
+    new_station_error,
+    place_next,
+    unheard_stations_error,
+)
 from gsparc.apps.maps.promised import promise_of, trained
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
@@ -28,6 +34,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     query = {
         "area": settings["area"], "threshold_db": float(config.threshold_db),
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
+        "antenna": Antenna(**settings["antenna"]),
     }  # fmt: skip
     place_next(predictor, count=1, dry=True, **query)  # refuses what cannot be before anything is fitted
     promise, error = promise_of(path, settings), NewStation()
@@ -53,6 +60,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
     lines = [
+        f"assumed: {z:.4g} m high, {query['antenna']} (see station_height_m, antenna)",
         f"now {placing.before:.1%} of the area with {level:g} {unit} or more",
         f"with a station at {where}: {placing.coverage[0]:.1%} "
         f"(90 % interval {placing.low[0]:.1%} to {placing.high[0]:.1%})",

@@ -29,7 +29,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     plan = plan_next(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
         plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
-        promise=promise, least_gain_db=float(config.least_gain_db), route=bool(config.route),
+        promise=promise, least_gain_db=float(config.least_gain_db), route=config.route,
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
@@ -46,7 +46,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     before += "" if predictor is None or predictor.site.stations is None else " of all stations"
-    if config.route or config.route_m is not None:
-        before += f", a walk of {plan.length_m:.4g} m"
+    if plan.walk:
+        kind = "walk" if config.walkable is None else "drive"
+        before += f", a {kind} of {plan.length_m:.4g} m, straight from place to place"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
     return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")

@@ -293,6 +293,10 @@ class HasJoint(Protocol):
         """See `gsparc.models.powers.together.field.JointPowerField.joint`."""
         ...
 
+    def with_station(self, place: np.ndarray, sectors: Tensor) -> HasJoint:
+        """See `gsparc.models.powers.together.field.JointPowerField.with_station`."""
+        ...
+
 
 @runtime_checkable
 class HasPaths(Protocol):

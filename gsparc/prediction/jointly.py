@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from gsparc.data.schema import Site
-from gsparc.models.method import HasProcess, Method
+from gsparc.models.method import HasJoint, HasProcess, Method
 from gsparc.models.per_station import OfStation, PerStation
 from gsparc.prediction.query import Queries
 
@@ -30,13 +30,37 @@ class Jointly:
             places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
             stations: (k,) numbers.
         """
-        every = self.method.every() if isinstance(self.method, PerStation) else None
-        if every is None or (known := every.joint()) is None:
+        known = self._known()
+        return None if known is None else self._together(known, places, torch.as_tensor(stations))
+
+    def elsewhere(self, places: Any, station: Any, sectors: Any) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `joint`.
+
+        Args:
+            places: (G, 3) of the moving end, world [m].
+            station: (3,) where they are to stand, world [m].
+            sectors: (k, 5) azimuth from north, -1 without a pattern, tilt, widths across and in height
+                [deg], and power over the mean of those that stand [dB].
+        """
+        if (known := self._known()) is None:
             return None
+        still = np.asarray(station, np.float64) - self.site.origin
+        more = known.with_station(still, torch.as_tensor(sectors, dtype=torch.float64))
+        count = 0 if self.site.stations is None else len(self.site.stations)
+        level, covariance, _ = self._together(more, places, count + torch.arange(len(sectors)))
+        return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+    def _known(self) -> HasJoint | None:
+        every = self.method.every() if isinstance(self.method, PerStation) else None
+        return None if every is None else every.joint()
+
+    def _together(
+        self, known: HasJoint, places: Any, stations: torch.Tensor
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
         if moving.dim() == 2:
             moving = moving[:, None].expand(-1, len(stations), 3)
-        level, covariance, noise = (part.numpy() for part in known.joint(moving, torch.as_tensor(stations)))
+        level, covariance, noise = (part.numpy() for part in known.joint(moving, stations))
         return level + 10 * np.log10(self.site.target_scale), covariance, noise
 
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float] | None:

@@ -179,16 +179,19 @@ class PowerProcess(Stored):
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
 
 
-def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def conditioned(
+    rows: Rows, prior: Prior, seed: int, least: int = LEAST_SILENT
+) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return the process given all rows, and what must be said of the silent ones.
 
     Args:
         rows: at least one.
         prior: settings as they are.
         seed: of rows that are drawn where there are too many.
+        least: silent rows that are used where fewer were heard.
     """
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
-        return _exact(rows.drawn(MOST_ROWS, seed), prior, seed)
+        return _exact(rows.drawn(MOST_ROWS, seed), prior, least)
     loud = rows.loud
     values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
     share = values.count / values.count.sum()
@@ -198,7 +201,7 @@ def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tupl
     if not rows.silent.any():
         return PowerProcess(given(prior, values, seed), heard), (note,)
     part = rows.drawn(MOST_ROWS, seed)
-    few, notes = _exact(part, prior, seed)
+    few, notes = _exact(part, prior, least)
     posterior = few.posterior
     assert isinstance(posterior, Exact)
     quiet = posterior.extra > 0
@@ -212,10 +215,10 @@ def conditioned(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tupl
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
-def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def _exact(rows: Rows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
     counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
     notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
-    places, decibels, extra, factor = _with_pseudo_values(rows, prior, seed, notes)
+    places, decibels, extra, factor = _with_pseudo_values(rows, prior, least, notes)
     posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
@@ -223,7 +226,7 @@ def _exact(rows: Rows, prior: Prior, seed: int) -> tuple[PowerProcess, tuple[str
 
 
 def _with_pseudo_values(
-    rows: Rows, prior: Prior, seed: int, notes: list[str]
+    rows: Rows, prior: Prior, least: int, notes: list[str]
 ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
     """Places, decibels, extra variances and a factor; pseudo-values of the silent rows that say anything."""
     places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
@@ -239,7 +242,7 @@ def _with_pseudo_values(
     side = torch.from_numpy(rows.side)[silent]
     doubt = side * known.doubt(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
-    most = min(max(int((~silent).sum()), LEAST_SILENT), MOST_SILENT)
+    most = min(max(int((~silent).sum()), least), MOST_SILENT)
     if len(near) > most:
         notes.append(f"{most} of {len(near)} rows near the level are used, the least certain ones")
         # Rows nearest to their level tell most; then back in the order of rows.

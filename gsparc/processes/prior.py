@@ -35,6 +35,13 @@ class Prior(Stored):
         """Return terms (n, Q) at places (n, D) [m]."""
         return places.new_zeros(len(places), 0) if self.trend is None else self.trend.columns(places)
 
+    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `mean` and `columns` at once, which may have much in common."""
+        if self.trend is None:
+            return self.mean(places), self.columns(places)
+        mean, columns = self.trend.parts(places)
+        return mean[:, None], columns
+
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
         result = self.kernel.between(a, b)

@@ -8,7 +8,7 @@ TR 36.814, table A.2.1.1-2:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -24,12 +24,15 @@ BEARING = 0.5  # radians, over which a sector's deviations from its pattern are 
 # Shared by all: exponent, bend [dB a squared decade], logarithms of both widths, floor [dB], tilt [deg].
 SHARED = torch.tensor((3.5, 0.0, 0.0, 0.0, 25.0, 0.0), dtype=torch.float64)
 SHARED_SPREAD = torch.tensor((0.7, 2.0, 0.2, 0.3, 4.0, 1.5), dtype=torch.float64)
-# Of a sector's own: azimuth, tilt [deg], logarithm of its width; slope [dB a decade].
-OWN_SPREAD = torch.tensor((5.0, 1.0, 0.1, 3.0), dtype=torch.float64)
+# Of a sector's own: azimuth, tilt [deg], logarithm of its width, floor [dB]; slope [dB a decade].
+OWN_SPREAD = torch.tensor((5.0, 1.0, 0.1, 2.5, 3.0), dtype=torch.float64)
 LEVEL_DB = 4.0  # of a band
 NONE = torch.zeros(0, dtype=torch.float64)
 NO_AZIMUTH = -1.0
+ROUND = torch.tensor([[NO_AZIMUTH, 0.0, 65.0, 10.0, 0.0]])  # without a pattern, of mean power
 STEP = 0.5  # of a spread, for slopes of the mean
+UNITS = STEP * torch.cat([SHARED_SPREAD, OWN_SPREAD[:4]]).diag()
+STEPS = torch.cat([UNITS, -UNITS, 0 * UNITS[:1]])  # of parameters, the last without any
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,12 @@ class Sectors(Trend):
         units = torch.nn.functional.one_hot
         return units(rank).double(), units(self.band, len(self.levels)).double()
 
+    def joined_by(self, sectors: Tensor) -> Sectors:
+        """Return these and further ones (k, 5), see `table`, of a site of their own and the first band."""
+        site = self.site.new_full((len(sectors),), int(self.site.max()) + 1)
+        band, table = torch.cat([self.band, 0 * site]), torch.cat([self.table, sectors.double()])
+        return replace(self, table=table, site=torch.cat([self.site, site]), band=band)
+
     def mean(self, places: Tensor) -> Tensor:
         """See `Trend`."""
         return self.at(places, self.shared, self.levels)
@@ -69,7 +78,7 @@ class Sectors(Trend):
     def at(  # type: ignore[override]
         self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
     ) -> Tensor:
-        """Return powers (..., n) [dB] for shared parameters (..., 6), levels; turn, tilt, width (..., 3)."""
+        """Return powers (..., n) [dB] for shared parameters (..., 6), levels; a sector's own (..., 4)."""
         assert self.law is not None
         number = places[:, 6].long()
         decades = self.law.decades(places) - self.middle
@@ -87,7 +96,8 @@ class Sectors(Trend):
         # From north and clockwise, as azimuths of sectors are given.
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
         down = torch.rad2deg(torch.atan2(-away[:, 2], flat))
-        turn, lean, wide = torch.zeros(3, 1) if own is None else own.unsqueeze(-1).unbind(-2)
+        turn, lean, wide, less = torch.zeros(4, 1) if own is None else own.unsqueeze(-1).unbind(-2)
+        floor = floor + less
         # Brought into [-180, 180): a sector to the north sees both sides of 0.
         across = torch.remainder(bearing - azimuth - turn + 180, 360) - 180
         across = 12 * (across / (width * torch.exp(wider + wide))).square()
@@ -95,28 +105,33 @@ class Sectors(Trend):
         loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
-    def slopes(self, places: Tensor) -> Tensor:
-        """Return what deviations of all shared parameters, and of a sector's own, do to means (n, 9) [dB]."""
-        # Central differences, half a spread to either side.
-        steps = STEP * torch.cat([SHARED_SPREAD, OWN_SPREAD[:3]]).diag()
-        shared, own = torch.cat([steps, -steps]).split((len(SHARED), 3), 1)
+    def slopes(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means (n,), and what deviations of all shared parameters, of a sector's own, do to them.
+
+        The latter (n, 10) [dB] are central differences, half a spread to either side.
+        """
+        shared, own = STEPS.split((len(SHARED), len(OWN_SPREAD) - 1), 1)
         ends = self.at(places, self.shared + shared, self.levels, own)
-        return ((ends[: len(steps)] - ends[len(steps) :]) / (2 * STEP)).T
+        return ends[-1], ((ends[: len(STEPS) // 2] - ends[len(STEPS) // 2 : -1]) / (2 * STEP)).T
 
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
-        slopes = self.slopes(places) if slopes is None else slopes
+        slopes = self.slopes(places)[1] if slopes is None else slopes
         bands = self.which[1][places[:, 6].long()]
         return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Trend`: each sector's azimuth, tilt, width and slope; what all share."""
+        """See `Trend`: each sector's azimuth, tilt, width, floor and slope; what all share."""
+        return self.parts(places)[1]
+
+    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Trend`."""
         assert self.law is not None
-        slopes, decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
-        parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[3] * decades], 1)
+        (mean, slopes), decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
+        parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         own = (self.which[0][places[:, 6].long(), :, None] * parts[:, None]).flatten(1)
-        return torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
+        return mean, torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class Shared:
         self.processes, self.never, self.columns = processes, never, columns
         self._alike = len({one.prior.kernel for one in processes.values()}) == 1
         self._blocks: dict[int, Block] = {}
-        self._stacks: dict[tuple[int, ...], tuple[Tensor, ...]] = {}
+        self._stacks: dict[tuple[tuple[int, ...], torch.dtype], tuple[Tensor, ...]] = {}
         self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
 
     def block(self, number: int) -> Block:
@@ -82,10 +82,10 @@ class Shared:
         Args:
             queries: (B, D) float64.
             number: (B,) int64, of the process; one that is not there has no rows.
-            exact: whether variances of few queries are of double precision too, as their slopes need it.
+            exact: whether few queries are answered in double precision too, as slopes need it.
         """
-        own, columns = self.never.columns(queries), self.columns(queries)
-        mean, left = self.never.mean(queries)[:, 0], torch.zeros(len(queries), dtype=torch.float64)
+        (mean, own), columns = self.never.parts(queries), self.columns(queries)
+        mean, left = mean[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for asked, at in self._asked(number):
             prior, more, white, shared = self._said(queries[at], asked, own[at], columns[at], not exact)
             # -1 stands where a process is asked less often than another of the batch.
@@ -132,17 +132,18 @@ class Shared:
         """What S processes of one prior say at (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P).
 
         The prior; the mean (S, k) beyond its; roots (k, n) of each of the variance that rows take away, none
-        without rows; and (S, k, P) of that which the shared weights leave.
+        without rows, float32 if `rounded`; and (S, k, P) of that which the shared weights leave.
         """
         more, shared = columns @ self.mean, columns.flatten(0, 1)
         prior, white = self.never, list[Tensor]()
         if asked[0] in self.processes:
             prior = self.processes[asked[0]].prior
-            places, terms, weights = self._stack(asked)
-            cross = deviation_of(prior) * (prior.kernel.between(queries, places) + own @ terms.mT)
-            more = more + (cross @ weights)[..., 0]
             # With less noise float32's rounding would show in the variance.
             rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
+            places, terms, weights = self._stack(asked, torch.float32 if rounded else torch.float64)
+            near = prior.kernel.between(queries.to(places), places)
+            cross = deviation_of(prior) * near.baddbmm(own.to(places), terms.mT)
+            more = more + (cross @ weights)[..., 0]
             blocks = [self.block(one) for one in asked]
             factors = [block.process.factor for block in blocks]
             parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
@@ -151,15 +152,15 @@ class Shared:
             else:
                 white = [one.whitened(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
-                told = [one @ block.columns for one, block in zip(white, blocks, strict=True)]
+                told = [one.double() @ block.columns for one, block in zip(white, blocks, strict=True)]
                 shared = shared - torch.cat(told)
         if len(self.mean):
             shared = self.factor.whitened(shared.T).T
         return prior, more, white, shared.unflatten(0, queries.shape[:2])
 
-    def _stack(self, asked: tuple[int, ...]) -> tuple[Tensor, ...]:
+    def _stack(self, asked: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
         """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""
-        if asked not in self._stacks:
+        if (asked, dtype) not in self._stacks:
             parts = []
             for one in asked:
                 block, process = self.block(one), self.processes[one]
@@ -168,8 +169,8 @@ class Shared:
                 weights = process.factor.solved(process.factor.lower @ rest)
                 parts.append((process.rows, process.prior.columns(process.rows), weights))
             padded = (pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True))
-            self._stacks[asked] = tuple(padded)
-        return self._stacks[asked]
+            self._stacks[asked, dtype] = tuple(part.to(dtype) for part in padded)
+        return self._stacks[asked, dtype]
 
     @torch.no_grad()
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:

@@ -123,6 +123,10 @@ class Trend(Columns):
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
         return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
 
+    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean (n,) and `columns` (n, Q)."""
+        return self.mean(places), self.columns(places)
+
     def columns(self, places: Tensor) -> Tensor:
         """Return what is uncertain of the mean (n, Q): constant, slope, and what `more` terms have."""
         parts = [torch.ones_like(places[:, :1])]

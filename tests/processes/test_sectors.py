@@ -37,11 +37,12 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
     places = torch.from_numpy(np.c_[at, np.tile(here, (40, 1)), number])
 
     def level(change: dict[str, float]) -> np.ndarray:
-        """With some of an exponent, an azimuth or a tilt more."""
+        """With some of an exponent, an azimuth, a tilt or a floor more."""
         decades = trend.law.decades(places).numpy() - 2
         loss = pattern(
             at, np.tile(here, (2, 1)), table[:, 0] + change.get("azimuth", 0),
-            table[:, 1] + 0.5 + change.get("tilt", 0), *(table[:, 2:4] * np.exp([0.1, -0.05])).T, 25.0,
+            table[:, 1] + 0.5 + change.get("tilt", 0), *(table[:, 2:4] * np.exp([0.1, -0.05])).T,
+            25.0 + change.get("floor", 0),
         )[np.arange(40), number]  # fmt: skip
         own = np.array([-50.0, -44])[number] + table[number, 4]
         return own - 10 * (3.2 + change.get("exponent", 0)) * decades - bend * decades**2 + loss
@@ -54,9 +55,10 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
     np.testing.assert_allclose(columns[:, 0], slope("exponent", SHARED_SPREAD[0]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 5], slope("tilt", SHARED_SPREAD[5]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 6:], LEVEL_DB * np.eye(2)[number])
-    own = terms[:, :8].reshape(40, 2, 4)
+    own = terms[:, :10].reshape(40, 2, 5)
     assert (own[np.arange(40), 1 - number] == 0).all()
     own = 2.0 * own[np.arange(40), number]
     np.testing.assert_allclose(own[:, 0], slope("azimuth", OWN_SPREAD[0]), atol=1e-5)
-    np.testing.assert_allclose(own[:, 3], OWN_SPREAD[3] * (trend.law.decades(places) - 2))
-    np.testing.assert_allclose(terms[:, 8:], columns / 2.0)
+    np.testing.assert_allclose(own[:, 3], slope("floor", OWN_SPREAD[3]), atol=1e-5)
+    np.testing.assert_allclose(own[:, 4], OWN_SPREAD[4] * (trend.law.decades(places) - 2))
+    np.testing.assert_allclose(terms[:, 10:], columns / 2.0)

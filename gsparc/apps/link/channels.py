@@ -58,12 +58,9 @@ class Channels:
 
 
 def channels(
-    method: Method,
-    data: Measurements,
-    rows: np.ndarray,
-    frequency_hz: np.ndarray,
+    method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray,
     antennas: slice = slice(None),
-) -> Channels:
+) -> Channels:  # fmt: skip
     """True and predicted channels of rows (n,) at absolute frequencies (K,) [Hz], of some of the antennas.
 
     Raises:

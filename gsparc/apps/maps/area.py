@@ -64,13 +64,9 @@ class Grid:
 
 
 def grid_of(
-    site: Site | None,
-    area: Any = None,
-    height_m: float | None = None,
-    step_m: float | None = None,
-    plan: FloorPlan | None = None,
-    stations: int = 1,
-) -> Grid:
+    site: Site | None, area: Any = None, height_m: float | None = None, step_m: float | None = None,
+    plan: FloorPlan | None = None, stations: int = 1,
+) -> Grid:  # fmt: skip
     """Return the cells of a map.
 
     Args:

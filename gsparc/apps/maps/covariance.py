@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
+from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.levels import joint_of
-from gsparc.apps.maps.making import levels_at, local_of
+from gsparc.apps.maps.making import ends_of, levels_at, local_of
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
-from gsparc.models.method import HasJoint, HasProcess
 from gsparc.prediction.predictor import Predictor
-from gsparc.processes.kernel import Kernel
-from gsparc.processes.posterior import Exact
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
 SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
@@ -52,12 +48,9 @@ class ErrorCovariance:
 
 
 def unknown_of(
-    predictor: Predictor,
-    places: np.ndarray,
-    stations: Sequence[str],
-    promise: Promise | None,
+    predictor: Predictor, places: np.ndarray, stations: Sequence[str], promise: Promise | None,
     other_end: Sequence[float] | None = None,
-) -> list[ErrorCovariance]:
+) -> list[ErrorCovariance]:  # fmt: skip
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
     Held-out blocks of `promise` scale the variances.
@@ -66,29 +59,20 @@ def unknown_of(
         DataError: the model has no process.
     """
     covariances = []
-    joint = joint_of(predictor.method)
     for name in stations:
         asking = predictor if predictor.site.stations is None else predictor.at(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
-        if joint is not None:
-            local = places - asking.site.origin
-            covariance, noise = _of_cell(joint, local, number)
-        else:
-            process = asking.method.process() if isinstance(asking.method, HasProcess) else None
-            if process is None:
-                name = asking.method.name
-                raise DataError(
-                    f"{name} states no covariance of its errors; plan with model=gp or gsparc of powers"
-                )
-            local = local_of(asking.site, places, other_end, process.places.shape[1] == 6)
-            assert isinstance(process.posterior, Exact)
-            covariance = process.posterior.covariance(torch.from_numpy(local)).numpy()
-            noise = process.kernel.amplitude * process.kernel.noise
+        known = asking.covariance(**ends_of(asking.site, places, other_end))
+        if known is None:
+            fault = "states no covariance of its errors; plan with model=gp or gsparc of powers"
+            raise DataError(f"{asking.method.name} {fault}")
+        covariance, noise = known
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
             spread = levels_at(asking, places, other_end)[1]
-            far = promise.distance(local[:, -promise.known.shape[1] :], number)
+            local = local_of(asking.site, places, other_end, asking.site.static_end is None)
+            far = promise.distance(local, number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
             error = calibration.expected_error(spread, inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
@@ -97,19 +81,12 @@ def unknown_of(
     return covariances
 
 
-def _of_cell(joint: HasJoint, local: np.ndarray, number: int) -> tuple[np.ndarray, float]:
-    """Covariance (S, S) of a station's levels at places (S, 3), and the noise of one measurement [dB^2]."""
-    stations = torch.full((len(local),), number)
-    _, covariance, noise = joint.joint(torch.from_numpy(local)[None], stations)
-    return (covariance[0] - noise.diag()).numpy(), float(noise[0])
-
-
 def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
     """Return the same where nothing was measured: shadowing about a level nobody knows, alike over
     `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
     """
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
-    variance = SHADOWING_DB**2
-    at = torch.from_numpy(places)
-    prior = variance * (Kernel.of_one(length, NOISE).between(at, at) + 1)
-    return [ErrorCovariance(prior.numpy(), variance * NOISE, np.ones(len(places)))]
+    variance, scaled = SHADOWING_DB**2, np.sqrt(3) * cdist(places, places) / length
+    # Matern-3/2 about a level that is as uncertain: Rasmussen and Williams 2006, eq. 4.17.
+    prior = variance * ((1 + scaled) * np.exp(-scaled) + 1)
+    return [ErrorCovariance(prior, variance * NOISE, np.ones(len(places)))]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from gsparc.apps.maps.area import Grid
 from gsparc.data.errors import DataError
@@ -19,6 +19,7 @@ from gsparc.data.links.georeference import Georeference
 
 REFUSED = -1  # of `best_server`
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
+NODES = 16  # levels of the strongest that its rivals are weighed against
 OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
 ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
 
@@ -47,6 +48,7 @@ class FieldMap:
         unit: of all levels.
         azimuth: (T,) that sectors face [deg from north], NaN of others.
         bands: (T,) carriers of the stations; () of one.
+        site: (T,) int64 of the stations.
     """
 
     grid: Grid
@@ -69,6 +71,7 @@ class FieldMap:
     unit: str = "dB"
     azimuth: np.ndarray = field(default_factory=lambda: np.zeros(0))
     bands: tuple[str, ...] = ()
+    site: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def refused(self) -> np.ndarray:
@@ -155,10 +158,10 @@ def server_chance(
     power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray,
     alike: np.ndarray | float = 0.0,
 ) -> np.ndarray:  # fmt: skip
-    """Least probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
+    """Probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
 
-    Errors are taken for normal; who beats one station is likelier to beat another, so that
-    the product of all is a lower bound (D. Slepian, Bell Syst. Tech. J. 41 (1962)).
+    Errors are taken for normal. Given the strongest's own level its rivals are taken for independent: who
+    beats one station is likelier to beat another, and the product of all chances alone is far too small.
 
     Args:
         power_db, error_db: predicted, and expected errors; NaN where unknown.
@@ -174,12 +177,16 @@ def server_chance(
     mean, spread = power_db[first, cell], error_db[first, cell]
     # A station unknown in a cell may be heard all the same: as likely as it usually is.
     rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
-    # Var(a - b) with their correlation; never 0, which would divide.
-    apart = np.sqrt(np.maximum(spread**2 + wrong**2 - 2 * alike * spread * wrong, 1e-12))
-    # A station that nothing is known of anywhere is left out: it counts as beaten.
-    beats = np.nan_to_num(norm.cdf((mean - rival) / apart), nan=1.0)
-    beats[first, cell] = norm.cdf((mean - floor_db[first]) / spread)
-    return np.where(number == REFUSED, np.nan, beats.prod(axis=0)).astype(np.float32)
+    # Of a rival given the strongest: never 0, which would divide.
+    left, total = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), np.zeros(len(number))
+    above = ndtr((mean - floor_db[first]) / spread)
+    for share in (np.arange(NODES) + 0.5) / NODES:
+        z = ndtri(1 - np.maximum(above, 1e-12) * share)  # equally likely levels above the floor
+        beats = ndtr((mean + spread * z - rival - alike * wrong * z) / left)
+        beats[first, cell] = 1.0
+        # A station that nothing is known of anywhere is left out: it counts as beaten.
+        total += np.nan_to_num(beats, nan=1.0).prod(axis=0)
+    return np.where(number == REFUSED, np.nan, above * total / NODES).astype(np.float32)
 
 
 def sinr(

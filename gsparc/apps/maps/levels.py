@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Kind, Measurements
 from gsparc.data.units import in_decibels
-from gsparc.models.method import HasJoint, Method, Prediction
-from gsparc.models.per_station import PerStation
+from gsparc.models.method import Prediction
+from gsparc.prediction.predictor import Predictor
 
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
@@ -61,25 +60,23 @@ def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return level, side
 
 
-def joint_of(method: Method) -> HasJoint | None:
-    """Return what knows how levels of all its stations go together; None where each is by itself."""
-    every = method.every() if isinstance(method, PerStation) else None
-    return None if every is None else every.joint()
-
-
-def cells_of(joint: HasJoint, site: Site, places: np.ndarray, stations: np.ndarray) -> np.ndarray:
+def cells_of(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
     """Levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places (n, 3) [m].
 
     Args:
-        joint: see `joint_of`.
-        site: of the model.
+        predictor: see `Predictor.joint`.
         places: of the moving end.
         stations: (T,) numbers.
+
+    Returns:
+        None where each station is by itself.
     """
-    moving = torch.from_numpy(places - site.origin)[:, None].expand(-1, len(stations), 3)
-    level, covariance, _ = (part.numpy() for part in joint.joint(moving, torch.from_numpy(stations)))
+    known = predictor.joint(places, stations)
+    if known is None:
+        return None
+    level, covariance, _ = known
     spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     # Of the correlations only those with the strongest decide which station serves.
     row, first = np.arange(len(level)), level.argmax(1)
     alike = covariance[row, first] / (spread * spread[row, first][:, None])
-    return np.stack([level + 10 * np.log10(site.target_scale), spread, alike], 1)
+    return np.stack([level, spread, alike], 1)

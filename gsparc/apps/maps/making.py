@@ -15,7 +15,7 @@ from gsparc.apps.maps.area import Grid, grid_of
 from gsparc.apps.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import Calibration
-from gsparc.apps.maps.levels import MAPPED, cells_of, joint_of, predicted
+from gsparc.apps.maps.levels import MAPPED, cells_of, predicted
 from gsparc.apps.maps.promise import Promise, stored_promise
 from gsparc.apps.maps.refining import refined
 from gsparc.data.errors import DataError
@@ -25,7 +25,7 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.method import HasJoint
+from gsparc.models.powers.together.network import sites_of
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -88,16 +88,16 @@ def map_of(
     stride = _stride(grid, promise, tolerance_db)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     every, computed = np.flatnonzero(grid.inside), 0
-    joint = joint_of(predictor.method)
+    joint = cells_of(predictor, grid.places(every[:1]), numbers) is not None
     alike = np.zeros_like(values["power_db"])
-    size = len(names) if joint is not None else 1  # stations that are asked about at once
+    size = len(names) if joint else 1  # stations that are asked about at once
     for row in range(0, len(names), size):
         chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
         ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
         parts, count = refined(ask, grid.inside, stride, tolerance_db)
         parts = parts.reshape(-1, size, *grid.shape)
         values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
-        alike[chosen] = parts[2] if joint is not None else 0.0
+        alike[chosen] = parts[2] if joint else 0.0
         computed += count * size
     if computed < len(names) * len(every):
         notes.append(
@@ -145,7 +145,7 @@ def map_of(
         grid, tuple(names), **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=extra, bands=bands,
         places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
-        azimuth=azimuths_of(site, numbers), unit=site.level_unit,
+        azimuth=azimuths_of(site, numbers), unit=site.level_unit, site=_sites(site, numbers),
     ).raised(level.raised_db, level.name)  # fmt: skip
 
 
@@ -156,11 +156,9 @@ def own_deviations(share: float) -> Calibration:
 
 
 def answering(
-    predictor: Predictor,
-    wanted: Sequence[str | int] | None,
-    promise: Promise | None = None,
+    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None,
     key: str = "stations",
-) -> tuple[list[str], list[str]]:
+) -> tuple[list[str], list[str]]:  # fmt: skip
     """Names of the stations that are mapped, and notes on the others.
 
     Those are stations that the model does not answer for, and, where something is promised, stations that it
@@ -217,28 +215,25 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
 
 
 def _asker(
-    predictor: Predictor, joint: HasJoint | None, grid: Grid, other: Sequence[float] | None,
+    predictor: Predictor, joint: bool, grid: Grid, other: Sequence[float] | None,
     names: Sequence[str], numbers: np.ndarray,
 ) -> Callable[[np.ndarray], np.ndarray]:  # fmt: skip
     """Levels and deviations [dB] of cells (n,), in chunks, as many at once as torch has threads.
 
-    Of one station (n, 2), or of those that `joint` knows together (n, 3 T), with the correlation of their
+    Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of their
     errors with the strongest's.
     """
-    own = predictor if joint is not None or predictor.site.stations is None else predictor.at(names[0])
+    own = predictor if joint or predictor.site.stations is None else predictor.at(names[0])
 
     def one(cells: np.ndarray) -> np.ndarray:
-        if joint is not None:
-            return cells_of(joint, own.site, grid.places(cells), numbers).reshape(len(cells), -1)
+        if (every := cells_of(own, grid.places(cells), numbers) if joint else None) is not None:
+            return every.reshape(len(cells), -1)
         return np.column_stack(levels_at(own, grid.places(cells), other))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        levels, parts = (
-            np.zeros((len(cells), 2 if joint is None else 3 * len(numbers))),
-            _chunks(cells, CHUNK),
-        )
+        levels, parts = np.zeros((len(cells), 3 * len(numbers) if joint else 2)), _chunks(cells, CHUNK)
         for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
             levels[number * CHUNK : number * CHUNK + len(values)] = values
         return levels
@@ -247,11 +242,9 @@ def _asker(
 
 
 def levels_at(
-    predictor: Predictor,
-    places: np.ndarray,
-    other: Sequence[float] | None = None,
+    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None,
     station: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
     parts = []
     for part in _chunks(places, CHUNK):
@@ -322,8 +315,9 @@ def _usual(
         if len(own):
             usual[row] = own.level_db.mean(), own.level_db.std()
             quiet = own.level_db[own.side > 0]
+            # The least level: those of lists are of their weakest cells, far above what is heard.
             # 1 %, not the least: one faulty row would place the floor anywhere.
-            floor[row] = max(least, quiet.max() if len(quiet) else np.quantile(own.level_db, 0.01))
+            floor[row] = max(least, quiet.min() if len(quiet) else np.quantile(own.level_db, 0.01))
     return usual, floor
 
 
@@ -339,6 +333,12 @@ def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
     """Directions (T,) that sectors face [deg from north], NaN of what is none."""
     sector = None if site.stations is None else site.stations.sector
     return np.full(len(numbers), np.nan) if sector is None else sector[numbers, 0]
+
+
+def _sites(site: Site, numbers: np.ndarray) -> np.ndarray:
+    """Numbers (T,) of the sites that stations belong to."""
+    stations = site.stations
+    return np.zeros(1, np.int64) if stations is None else sites_of(stations, stations.position)[numbers]
 
 
 def _still(site: Site, names: Sequence[str]) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, Normalize, to_hex
 from matplotlib.transforms import Affine2D
 from scipy.ndimage import distance_transform_edt
 from scipy.ndimage import label as areas_of
@@ -38,6 +38,7 @@ GREY = "#AAAAAA"  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
 MOST_COLOURS = 10
+SHADES = (0.0, 0.45, -0.35, 0.7, -0.6)  # of the stations of a site: towards white, or black
 BESIDE = 2  # cells between areas that must not have one colour
 DEEP = 0.025  # of the map's longer side, from the edge of an area that its name is written on
 UNSURE = "hatched: more likely another station, or none that is heard"
@@ -80,6 +81,7 @@ class Layer:
         values: (ny, nx) float, NaN where nothing is said.
         legend: what its colours mean, with the unit.
         words: names of whole numbers, for a layer of classes; "" of those that are nowhere on the map.
+        group: (n,) of each class, those of one have shades of one colour; None: each is one.
         unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
     """
 
@@ -88,12 +90,31 @@ class Layer:
     legend: Legend
     words: tuple[str, ...] = ()
     unsure: tuple[np.ndarray, str] | None = None
+    group: np.ndarray | None = None
 
     def table(self) -> np.ndarray:
         """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
-        return np.asarray(colormaps["tab10"](shades(self.values, len(self.words))))
+        every = np.arange(len(self.words)) if self.group is None else self.group
+        number = np.unique(every, return_inverse=True)[1]
+        where = np.append(number, np.nan)[np.nan_to_num(self.values, nan=len(number)).astype(int)]
+        colours = np.asarray(colormaps["tab10"](shades(where, int(number.max()) + 1)[number]))
+        rank = np.tril(number[:, None] == number, -1).sum(1)
+        shade = np.array(SHADES)[rank % len(SHADES)][:, None]
+        # A positive share goes to white, a negative one to black.
+        colours[:, :3] += np.abs(shade) * ((shade > 0) - colours[:, :3])
+        return colours
+
+    def listed(self) -> dict[str, list[Any]]:
+        """Return columns of its classes, largest first: number, name, share of the map and colour."""
+        count = np.bincount(self.values[np.isfinite(self.values)].astype(int), minlength=len(self.words))
+        order = [int(k) for k in np.argsort(-count, kind="stable") if count[k]]
+        share, colour = count / max(count.sum(), 1), self.table()
+        return {
+            "number": order, "station": [self.words[k] for k in order],
+            "share": [round(float(share[k]), 4) for k in order], "colour": [to_hex(colour[k]) for k in order],
+        }  # fmt: skip
 
 
 def shades(classes: np.ndarray, count: int) -> np.ndarray:
@@ -138,17 +159,17 @@ def layers(field: FieldMap) -> Iterator[Layer]:
     yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
     if several:
         doubt = (field.unsure, UNSURE) if field.unsure.any() else None
-        yield _servers("best_server", field.layer("best_server"), field.stations, doubt)
+        yield _servers("best_server", field.layer("best_server"), field.stations, field.site, doubt)
     for band in dict.fromkeys(field.bands):
-        own = field.power_db[np.array(field.bands) == band]
-        names = tuple(name for name, its in zip(field.stations, field.bands, strict=True) if its == band)
+        its = np.array(field.bands) == band
+        own, names = field.power_db[its], tuple(np.array(field.stations)[its].tolist())
         if not np.isfinite(own).any():
             continue
         strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.shape)
         level = np.take_along_axis(own, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
         yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
         where = np.where(strongest == REFUSED, np.nan, strongest)
-        yield _servers(f"best_server {band}", where, names, None)
+        yield _servers(f"best_server {band}", where, names, field.site[its], None)
     if np.isfinite(field.sinr_db).any():
         label = "signal over interference and noise [dB]"
         yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
@@ -166,19 +187,20 @@ def layers(field: FieldMap) -> Iterator[Layer]:
             yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
 
 
-def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], doubt: Any) -> Layer:
+def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], site: np.ndarray, doubt: Any) -> Layer:
     there = np.unique(number[np.isfinite(number)]).astype(int)
     words = tuple(one if k in there else "" for k, one in enumerate(stations))
-    return Layer(name, number, Legend("strongest station", -0.5, len(words) - 0.5), words, doubt)
+    legend = Legend("strongest station", -0.5, len(words) - 0.5)
+    return Layer(name, number, legend, words, doubt, site if len(site) else None)
 
 
-def file_name(layer: Layer) -> str:
-    """Return the name of its PNG, without what a file system may not like."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
+def file_name(layer: Layer, suffix: str = ".png") -> str:
+    """Return the name of its file, without what a file system may not like."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + suffix
 
 
 def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
-    """Save one layer as PNG, over a floor plan."""
+    """Save one layer, over a floor plan, in the format of the file's ending."""
     left, right, low, high = field.grid.extent
     width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
     figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
@@ -207,13 +229,15 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
 
 
 def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
-    """Names on their areas; of few stations also in the legend."""
+    """Names on their areas; those of the largest also in the legend."""
     for row, column, word in named_areas(layer.values, layer.words):
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
                   path_effects=OUTLINE)  # fmt: skip
-    shown = [(colour, word) for colour, word in zip(layer.table(), layer.words, strict=True) if word]
-    for colour, word in shown if len(shown) <= MOST_COLOURS else ():
+    listed = layer.listed()
+    for colour, word in [*zip(listed["colour"], listed["station"], strict=True)][:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
+    if len(listed["number"]) > MOST_COLOURS:
+        axis.plot([], [], " ", label=f"all {len(listed['number'])}: {file_name(layer, '.csv')}")
 
 
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
@@ -229,7 +253,8 @@ def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **
     """Values (ny, nx) of cells, through which a plan beneath them is seen."""
     if plan is not None:
         draw_plan(axis, plan)
-    how = {"origin": "lower", "extent": grid.extent, "interpolation": "nearest", "zorder": 2}
+    # Not "nearest", which vector formats draw at the screen's resolution.
+    how = {"origin": "lower", "extent": grid.extent, "interpolation": "none", "zorder": 2}
     return axis.imshow(values, alpha=1.0 if plan is None else 0.65, **how, **colours)
 
 
@@ -297,12 +322,8 @@ def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = 
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
-    figure.colorbar(
-        dots,
-        ax=axis,
-        label=f"share of the area with {threshold_db:g} {unit} or more, with a station here",
-        shrink=0.85,
-    )
+    label = f"share of the area with {threshold_db:g} {unit} or more, with a station here"
+    figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     draw_stations(axis, placing.stations)
     draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
     bounded(axis, (left, low), (right, high))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,57 @@ from gsparc.apps.maps.promise import Promise, evidence_of
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
-from gsparc.data.limits import check_arguments, whole
+from gsparc.data.limits import Checked, check_arguments, finite, number, setting, whole
+from gsparc.data.query_places import read_query_places
 from gsparc.data.splits import Fold
+from gsparc.data.tables import is_table
+from gsparc.prediction.placing import in_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
 SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
+NO_PATTERN = -1.0  # in place of an azimuth
+
+
+@dataclass(frozen=True)
+class Antenna(Checked):
+    """What a station that is not there yet transmits with.
+
+    >>> str(Antenna())
+    'one antenna alike in all directions, 0 dB over the mean power of those that stand'
+
+    Attributes:
+        azimuth: of its sectors from north [deg], one or a list; None: alike in all directions.
+        tilt: below the horizon [deg], as widths of beams across and in `height`; of sectors alone.
+        power_db: over the mean of the stations that stand [dB].
+    """
+
+    azimuth: float | Sequence[float] | None = None
+    tilt: float = setting(6.0, number(-90, 90))
+    width: float = setting(65.0, number(0, 360, open_low=True))
+    height: float = setting(10.0, number(0, 180, open_low=True))
+    power_db: float = setting(0.0, number(-100, 100))
+
+    def sectors(self) -> np.ndarray:
+        """Return (k, 5), see `gsparc.prediction.predictor.Predictor.elsewhere`.
+
+        Raises:
+            DataError: azimuths that are no numbers.
+        """
+        azimuth = np.atleast_1d(finite(NO_PATTERN if self.azimuth is None else self.azimuth))
+        if azimuth.ndim > 1 or not len(azimuth):
+            raise DataError(f"antenna.azimuth={self.azimuth}: degrees from north, like [0,120,240]")
+        azimuth = azimuth if self.azimuth is None else azimuth % 360
+        rest = (self.tilt, self.width, self.height, 0.0)
+        return np.column_stack([azimuth, np.tile(rest, (len(azimuth), 1))])
+
+    def __str__(self) -> str:
+        beams = "one antenna alike in all directions"
+        if self.azimuth is not None:
+            towards = ", ".join(f"{one:g}" for one in self.sectors()[:, 0])
+            beams = f"sectors towards {towards} deg, tilt {self.tilt:g}, {self.width:g} x {self.height:g}"
+        return f"{beams}, {self.power_db:g} dB over the mean power of those that stand"
 
 
 @dataclass(frozen=True)
@@ -65,26 +110,21 @@ class Placing:
 
 
 def place_next(
-    predictor: Predictor,
-    area: Any = None,
-    *,
-    threshold_db: float = -100.0,
-    height_m: float | None = None,
-    sites: Any = None,
-    station_height_m: float | None = None,
-    count: int = 100,
-    promise: Promise | None = None,
-    error: NewStation | None = None,
+    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0, height_m: float | None = None,
+    sites: Any = None, station_height_m: float | None = None, count: int = 100,
+    promise: Promise | None = None, error: NewStation | None = None, antenna: Antenna | None = None,
     dry: bool = False,
-) -> Placing:
+) -> Placing:  # fmt: skip
     """Try one more station at every candidate.
 
     Args:
         predictor: of powers at several stations, learned together.
         area, height_m, threshold_db: see `map_of`.
-        sites: GeoJSON of where a station may stand: polygons or lines; None: the whole area.
+        sites: where a station may stand: GeoJSON of polygons or lines, or a table of places (see
+            `read_query_places`), all of which are tried; None: the whole area.
         station_height_m: world; None: the middle height of the stations that stand.
         count: candidates, about.
+        antenna: of the new station.
         promise: see `map_of`, of the stations that stand.
         error: see `new_station_error`; None: the model's own deviations.
         dry: predict one cell of each station that stands alone: whether everything asked for is possible.
@@ -97,30 +137,27 @@ def place_next(
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: the model of {site.name} knows no stations among which to put another")
     grid = coarse_grid(predictor, area, height_m)
+    antenna = antenna or Antenna()
     still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
     height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
     candidates = _candidates(grid, sites, predictor, height, count)
     cells = grid.places()
     try:
-        _new(predictor, candidates[0], cells[:1])
+        _new(predictor, candidates[0], cells[:1], antenna)
+    except DataError:
+        raise
     except ValueError as refused:
         raise unheard_stations_error(f"{predictor.method.name} ({refused})") from None
     left, right, south, north = grid.extent
     now = map_of(
-        predictor,
-        [left, south, right, north],
-        height_m=grid.height,
-        step_m=grid.step,
-        threshold_db=threshold_db,
-        promise=promise,
-        dry=dry,
-    )
-    flat = grid.inside.reshape(-1)
-    old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)
+        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
+        threshold_db=threshold_db, promise=promise, dry=dry,
+    )  # fmt: skip
+    old_outage = np.nan_to_num(now.outage[grid.inside], nan=1.0)
     error = error or NewStation()
 
     def tried(place: np.ndarray) -> np.ndarray:
-        level, spread = _new(predictor, place, cells)
+        level, spread = _new(predictor, place, cells, antenna)
         goals = np.empty(3)
         # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
@@ -165,6 +202,12 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStation:
 
 
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> np.ndarray:
+    if sites is not None and is_table(sites):
+        site, end = predictor.site, predictor.site.static_end or "tx"
+        asked = read_query_places(sites, (end,))
+        where = asked.ends[end]
+        above = np.full(len(asked), height) if where.height is None else where.height
+        return in_world(replace(asked, ends={end: replace(where, height=above)}), site)[end]
     if sites is not None:
         every = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
@@ -173,9 +216,20 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
     return np.column_stack([few[:, :2], np.full(len(few), height)])
 
 
-def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level and deviation (n,) [dB] of a station at `place` (3,) in cells (n, 3)."""
-    level, spread = levels_at(predictor, cells, station=place)
+def _new(
+    predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna
+) -> tuple[np.ndarray, np.ndarray]:
+    """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
+    sectors = antenna.sectors()
+    known = predictor.elsewhere(cells, place, sectors)
+    if known is None and antenna.azimuth is not None:
+        raise DataError(f"antenna.azimuth: {predictor.method.name} knows no patterns; model=gsparc does")
+    if known is None:
+        level, spread = levels_at(predictor, cells, station=place)
+    else:
+        strongest = known[0].argmax(1)[:, None]
+        level, spread = (np.take_along_axis(part, strongest, 1)[:, 0] for part in known)
+    level = level + antenna.power_db
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 

@@ -81,22 +81,12 @@ class Plan:
 
 
 def plan_next(
-    predictor: Predictor | None,
-    count: int = 20,
-    area: Any = None,
-    *,
-    height_m: float | None = None,
-    walkable: Any = None,
-    plan: FloorPlan | None = None,
-    stations: Sequence[str | int] | None = None,
-    other_end: Sequence[float] | None = None,
-    promise: Promise | None = None,
-    least_gain_db: float = 0.0,
-    route: bool = False,
-    start: Sequence[float] | None = None,
-    route_m: float | None = None,
+    predictor: Predictor | None, count: int = 20, area: Any = None, *, height_m: float | None = None,
+    walkable: Any = None, plan: FloorPlan | None = None, stations: Sequence[str | int] | None = None,
+    other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
+    route: bool | None = None, start: Sequence[float] | None = None, route_m: float | None = None,
     length_m: float | None = None,
-) -> Plan:
+) -> Plan:  # fmt: skip
     """Choose places to measure next, as a batch.
 
     >>> plan = gsparc.apps.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
@@ -112,7 +102,7 @@ def plan_next(
         stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
         promise: evidence of held-out blocks, which scales the model's own variances.
         least_gain_db: stop where a place takes less than this off the expected error.
-        route: whether places are put in the order of a short walk.
+        route: whether places are put in the order of a short walk, or drive; None: with `walkable`.
         start: (2,) where the walk starts [m]; None: anywhere.
         route_m: longest walk [m]; None: any.
         length_m: before anything is measured, over which powers are alike [m].
@@ -139,7 +129,7 @@ def plan_next(
     before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-    walk = route or route_m is not None
+    walk = (walkable is not None if route is None else route) or route_m is not None
     order = tour.number if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
@@ -151,12 +141,9 @@ def plan_next(
 
 
 def coarse_grid(
-    predictor: Predictor | None,
-    area: Any,
-    height_m: float | None,
-    plan: FloorPlan | None = None,
+    predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None,
     promise: Promise | None = None,
-) -> Grid:
+) -> Grid:  # fmt: skip
     """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
     fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
@@ -213,14 +200,9 @@ def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def greedy(
-    unknown: list[ErrorCovariance],
-    free: np.ndarray,
-    wanted: np.ndarray,
-    places: np.ndarray,
-    count: int,
-    least_gain_db: float,
-    tour: Tour,
-) -> tuple[list[int], list[float], str]:
+    unknown: list[ErrorCovariance], free: np.ndarray, wanted: np.ndarray, places: np.ndarray, count: int,
+    least_gain_db: float, tour: Tour,
+) -> tuple[list[int], list[float], str]:  # fmt: skip
     """Chosen places, expected error after each, and why it stopped early."""
     free = free.copy()
     chosen: list[int] = []

@@ -77,10 +77,9 @@ def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
     if coverage is None:
         own = "intervals are the model's own deviations, and places far from data are not refused"
         return [*notes, f"no promise: {own}"]
-    apart = (
-        f"{coverage.heard_share:.1%} of those with a level, {coverage.silent_share:.1%} of those below one"
-    )
-    apart = "" if np.isnan(coverage.silent_share) else f", {apart}"
+    silent = f", of those below one, which nobody can see, {coverage.silent_share:.1%} by its own belief"
+    apart = f", {coverage.heard_share:.1%} of those with a level{silent}"
+    apart = "" if np.isnan(coverage.silent_share) else apart
     ours = f"{coverage.share:.1%} did{apart} (mean width {coverage.width_db:.1f} dB"
     own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
     notes.append(

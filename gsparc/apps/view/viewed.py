@@ -119,11 +119,9 @@ class Viewed:
 
 
 def open_viewed(
-    path: str | Path,
-    dataset: Mapping[str, Any] | None = None,
-    station: str | int | None = None,
+    path: str | Path, dataset: Mapping[str, Any] | None = None, station: str | int | None = None,
     unit: str | None = None,
-) -> Viewed:
+) -> Viewed:  # fmt: skip
     """Read a checkpoint, and its data where they are still there.
 
     Args:

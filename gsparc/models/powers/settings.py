@@ -38,7 +38,7 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
 COMPARED_ON = 500  # of them, constant and distance law; with little effort
-WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
+WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1

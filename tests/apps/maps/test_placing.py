@@ -7,7 +7,7 @@ import pytest
 from towns import MASTS, town_file, town_model
 
 import gsparc
-from gsparc.apps.maps.placing import NewStation, new_station_error, place_next
+from gsparc.apps.maps.placing import Antenna, NewStation, new_station_error, place_next
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
@@ -35,6 +35,19 @@ def test_the_best_place_is_far_from_those_that_serve(together):
     assert apart.min() > 20 and found.coverage[0] > found.before
     assert (found.low <= found.coverage + 0.05).all() and (found.coverage <= found.high + 0.05).all()
     assert (np.diff(found.coverage) <= 1e-12).all() and (found.places[:, 2] == 8).all()
+
+
+def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
+    (tmp_path / "roofs.csv").write_text("x,y,z\n5,5,20\n75,5,12\n")
+    predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "sites": tmp_path / "roofs.csv"}
+    found = place_next(predictor, **how)
+    assert sorted(found.places.tolist()) == [[5, 5, 20], [75, 5, 12]]
+    louder = place_next(predictor, **how, antenna=Antenna(power_db=10))
+    assert louder.coverage[0] > found.coverage[0] + 0.05
+    with pytest.raises(DataError, match="knows no patterns"):
+        place_next(predictor, **how, antenna=Antenna(azimuth=[0, 120]))
+    with pytest.raises(DataError, match="degrees from north"):
+        place_next(predictor, **how, antenna=Antenna(azimuth="north"))
 
 
 def test_two_stations_leave_none_out(together):

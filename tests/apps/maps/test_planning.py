@@ -50,7 +50,8 @@ def test_a_first_design_spreads_over_the_floor():
 def test_corridors_and_a_length(tmp_path, predictor):
     lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
     (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
-    found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", route=True, start=[5, 5])
+    found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5])
+    assert found.walk and not plan_next(predictor, 2).walk
     on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
     assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
     short = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)

@@ -8,6 +8,8 @@ left out want it. Either end may be the station.
 from __future__ import annotations
 
 import math
+from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -30,7 +33,7 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import REACH
 from gsparc.processes.prior import Prior
-from gsparc.processes.sectors import Sectors
+from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import Shared
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -145,7 +148,7 @@ class JointPowerField(ClosedForm):
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
             elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
-        self.elsewhere = Shared({}, self.own.never, self.unheard.columns, (elsewhere.factor, elsewhere.mean))
+        self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
         loud = used if used.silent.all() else used.loud
         self.whole = max(float(loud.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
@@ -242,7 +245,35 @@ class JointPowerField(ClosedForm):
             processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
             weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
             self.posterior = Shared(processes, never, self.heard.columns, weights[0])
-            self.elsewhere = Shared({}, never, self.unheard.columns, weights[1])
+            self.elsewhere = self._elsewhere(weights[1])
+
+    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> Shared:
+        """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
+        never, network = self.own.never, self.network
+        never = never if network is None else replace(never, trend=network.joined_by(ROUND))
+        return Shared({}, never, self.unheard.columns, weights)
+
+    def with_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
+        """Return one that knows k further stations, of no rows, as its last.
+
+        Args:
+            place: (3,) local [m].
+            sectors: (k, 5) of a network, see `Sectors.table`; of others azimuths are -1.
+
+        Raises:
+            DataError: azimuths, and this is no network.
+            ValueError: before `condition`.
+        """
+        _, elsewhere = self._conditioned()
+        result, network = copy(self), self.network
+        result.places = np.concatenate([self.places, np.broadcast_to(place, (len(sectors), 3))])
+        if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
+            raise DataError("azimuths of a new station: this model was learned without azimuths")
+        if network is not None:
+            never = replace(self.own.never, trend=network.joined_by(sectors))
+            result.own = replace(self.own, never=never)
+        result.elsewhere = result._elsewhere((elsewhere.factor, elsewhere.mean))
+        return result
 
     def _conditioned(self) -> tuple[Shared, Shared]:
         if self.posterior is None or self.elsewhere is None:
@@ -270,7 +301,8 @@ class JointPowerField(ClosedForm):
         if self.network is None:
             return places, number
         site = self.network.site[number.clamp_min(0)]
-        return torch.cat([places, number[:, None].clamp_min(0)], 1), torch.where(number < 0, NEVER, site)
+        sector = torch.where(number < 0, len(self.network.table), number)  # the last, without a pattern
+        return torch.cat([places, sector[:, None]], 1), torch.where(number < 0, NEVER, site)
 
     def _by_law(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.

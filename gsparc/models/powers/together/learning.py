@@ -21,7 +21,7 @@ from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import conditioned
+from gsparc.processes.powers import LEAST_SILENT, conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
 from gsparc.processes.trend import Trend
@@ -41,7 +41,7 @@ TRIED_PLACES = 300  # that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
-TOLD = 100.0  # amplitudes of a pseudo-value's variance, beyond which it tells nothing (.01 dB)
+TOLD = 20.0  # amplitudes of a pseudo-value's variance, beyond which it is left out: .5 % of rmse at most
 WIDEST = 4.0  # factor that variances are corrected by at most
 
 
@@ -90,7 +90,9 @@ class Own:
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
-                known = conditioned(part, Prior(prior.kernel, wide), seed)[0].posterior  # type: ignore[arg-type]
+                # Each sector of a site has a level of its own, which its silent rows bound.
+                least = LEAST_SILENT * len(np.unique(part.places[:, 6:], axis=0))
+                known = conditioned(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]

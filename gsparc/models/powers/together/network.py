@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.errors import Caution
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import LinkRows
 from gsparc.processes.censored import Sites
@@ -59,11 +59,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
     assert stations is not None
     places = stations.position if places is None else places
     sector = np.full((len(places), len(USUAL) + 1), np.nan) if stations.sector is None else stations.sector
-    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
-    stem = np.array([re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name) for name in stations.name])
-    near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
-    near |= sector[:, None, 5] == sector[:, 5]  # as a column of the list says
-    site = connected_components(near)[1].astype(np.int64)
+    site = sites_of(stations, places)
     levels = () if data.censored is None else np.unique(data.target[data.censored > 0])
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
     if not several and not np.isfinite(sector[:, 0]).any():
@@ -80,6 +76,21 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
     table[:, 4] -= table[:, 4].mean()
     which = torch.from_numpy(np.stack([site, band]))
     return Sectors(0.0, table=torch.from_numpy(table), site=which[0], band=which[1])
+
+
+def sites_of(stations: Stations, places: np.ndarray) -> np.ndarray:
+    """Return numbers (T,) int64 of the sites that stations at places (T, 3) [m] belong to.
+
+    >>> at = np.array([[0.0, 0, 0], [20, 0, 0], [500, 0, 0]])
+    >>> sites_of(Stations(at, ("A-1", "A-2", "B-1")), at)
+    array([0, 0, 1])
+    """
+    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
+    stem = np.array([re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name) for name in stations.name])
+    near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
+    if stations.sector is not None:
+        near |= stations.sector[:, None, 5] == stations.sector[:, 5]  # as a column of the list says
+    return connected_components(near)[1].astype(np.int64)
 
 
 def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
@@ -171,7 +182,7 @@ def _turned(
         part = rows.at(np.flatnonzero(rows.places[:, 6] == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
             continue
-        own = torch.nn.functional.pad(TURNS.double()[:, None], (0, 2))  # neither tilted nor wider
+        own = torch.nn.functional.pad(TURNS.double()[:, None], (0, 3))  # all else as it is
         mean = trend.at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
         levels = (gains[t] + GAINS)[:, None]
         likely = _misfit(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)

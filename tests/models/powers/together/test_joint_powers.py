@@ -104,7 +104,9 @@ def test_it_is_the_dense_process():
     mean = gram[count:, :count] @ inner[:, 0]
     variance = gram[count:, count:].diagonal() - (gram[count:, :count] * inner[:, 1:].T).sum(1)
     places = torch.from_numpy(asked.places)
-    said = posterior.answer(places, torch.from_numpy(asked.station))
+    rounded = posterior.answer(places, torch.from_numpy(asked.station))
+    said = posterior.answer(places, torch.from_numpy(asked.station), exact=True)
+    assert np.allclose(rounded[0], said[0], atol=1e-4) and np.allclose(rounded[1], said[1], atol=1e-4)
     assert np.allclose(said[0].numpy(), asked.decibels - values[count:] + mean, atol=1e-8)
     assert np.allclose(said[1].numpy(), variance, atol=1e-8)
     known = gram[count:, count:] - gram[count:, :count] @ inner[:, 1:]

@@ -16,8 +16,12 @@ from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_stations
+from gsparc.models.powers.together.field import JointPowerField
+from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.network import network_of
+from gsparc.models.powers.together.terms import Terms, link_rows
 from gsparc.ops import Pose
+from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, SectorKernel, Sectors
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
@@ -62,6 +66,10 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
     assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
+    more = every.joint().with_station(np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]]))
+    around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
+    east, west = more.joint(around, torch.tensor([30, 31]))[0]
+    assert east[0] > west[0] + 10 and east[1] == pytest.approx(float(west[1]))  # no pattern
     assert draw_sector_levels(method, one.data(6), np.arange(500), tmp_path / "sectors.png")
     wrong = one.azimuth != network(1, moments=300, asked=120).azimuth
     named = [
@@ -148,6 +156,42 @@ def test_the_pattern_of_a_sector():
     ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
     assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
+
+
+def given_settings() -> JointPowerField:
+    """A network's field whose settings nobody learned."""
+    one = network(1, moments=60, asked=20)
+    data, rows = one.data(6), np.arange(360)
+    known = network_of(data)
+    trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
+    own = Own(Prior(SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0), trend), {})
+    terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
+    field.condition(data, rows)
+    return field
+
+
+def test_slopes_of_all_cells_at_one_place_are_exact():
+    """Single queries are answered in float32, whose steps are larger than a slope's error."""
+    field, turn = given_settings(), torch.eye(3).expand(30, 3, 3).double()
+    still, number = torch.zeros(30, 3).double(), torch.arange(30)
+
+    def said(place: torch.Tensor) -> torch.Tensor:
+        found = field.predict(Query(still, Pose(place.expand(30, 3), turn), station=number))
+        return torch.cat([found.mean[:, 0].log10(), found.variance.log10()])
+
+    place, step = torch.tensor([40.0, -30, 1.5]).double(), torch.eye(3).double() * 1e-4
+    slope = torch.autograd.functional.jacobian(said, place)
+    for axis in range(3):
+        ends = (said(place + step[axis]) - said(place - step[axis])) / 2e-4
+        assert torch.allclose(slope[:, axis], ends, rtol=1e-4, atol=1e-7)
+
+
+def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
+    field = given_settings()
+    around = Pose(places(0, 0, 90, 180, 270)[:, :3] + 3000, torch.eye(3).expand(4, 3, 3).double())
+    said = field.predict(Query(torch.full((4, 3), 3000.0).double(), around)).mean.log10()
+    assert float(said.max() - said.min()) < 1e-6
 
 
 def test_sectors_of_a_site_share_shadowing():
