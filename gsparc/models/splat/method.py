@@ -243,7 +243,7 @@ class LearnedField(Method):
             self.fitted().error = error
         prepared = (budget.counted - started).wall
         self.init_s = (self.init_s or 0.0) + prepared
-        again = " again, on all rows" if self.spent else ""
+        again = "" if stage == "train" else " again, on all rows"
         self.spent["initialiser" + again] = prepared
         if not steps:
             return prepared
