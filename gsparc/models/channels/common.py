@@ -36,8 +36,10 @@ class Common:
             levels.append(scale * float(away) ** 2)
             if direct is not None:
                 gains.append(away * direct.power[0] * (direct.wave(group).conj() @ alpha).mean())
-        none = torch.zeros(1, dtype=torch.complex128)
-        each, count = torch.stack(gains) if gains else none, len(known)
+        each, count = (
+            torch.stack(gains) if gains else torch.zeros(len(known), dtype=torch.complex128),
+            len(known),
+        )
         gain, whole = each.mean(), each.abs().square().mean()
         # Unbiased: of n ends |mean|^2 is too large by a variance / n.
         steady = ((count * gain.abs().square() - whole) / max(count - 1, 1)).clamp_min(0)
@@ -47,7 +49,9 @@ class Common:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
         direct, away = prior.get(Direct), _away(prior, at.slot)
         before = self.level / away**2 * prior.variance(at)
-        wave = at.places.new_zeros(len(at.places)) if direct is None else direct.wave(at) / away
+        wave = (
+            torch.zeros(len(at.places), dtype=torch.complex128) if direct is None else direct.wave(at) / away
+        )
         return self.gain * wave, (before - self.explained * wave.abs().square()).clamp_min(0), before
 
 
