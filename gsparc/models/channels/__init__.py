@@ -1,1 +1,1 @@
-"""Complex channels as a Gaussian field in closed form: leakage, direct wave and a diffuse field."""
+"""Complex channels as a Gaussian field in closed form: leakage, direct wave, mirrors and a diffuse field."""

@@ -11,15 +11,17 @@ from torch import Tensor
 from gsparc.models.channels.columns import At, Group, Slot
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
+from gsparc.models.channels.terms.spherical import Spherical
 
 
 @dataclass(frozen=True)
 class Common:
-    """The gain of the direct wave, 0 where there is none, and the level of ends.
+    """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
 
     Attributes:
-        gain: () complex128 [m], the ends' mean times distances to the places' middle.
-        explained: () [m^2] what knowing it takes from the power.
+        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images the smaller
+            the less sure it is: small where phases are unrelated.
+        explained: (J,) [m^2] what knowing it takes from the power.
         level: [m^2] power that covariances are in units of.
     """
 
@@ -30,32 +32,45 @@ class Common:
     @staticmethod
     def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
         """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
-        direct, gains, levels = prior.get(Direct), [], []
+        gains, levels = [], []
         for group, alpha, scale in known:
-            away = _away(prior, group.slot)
-            levels.append(scale * float(away) ** 2)
-            if direct is not None:
-                gains.append(away * direct.power[0] * (direct.wave(group).conj() @ alpha).mean())
-        each, count = (
-            torch.stack(gains) if gains else torch.zeros(len(known), dtype=torch.complex128),
-            len(known),
-        )
-        gain, whole = each.mean(), each.abs().square().mean()
+            waves, power, away = _waves(prior, group)
+            gains.append(away * power * (waves.conj() @ alpha).mean(1))
+            levels.append(scale * float(_away(prior, group.slot)) ** 2)
+        each = torch.stack(gains)
+        count, gain = len(each), each.mean(0)
+        whole, mean = each.abs().square().mean(0), gain.abs().square()
         # Unbiased: of n ends |mean|^2 is too large by a variance / n.
-        steady = ((count * gain.abs().square() - whole) / max(count - 1, 1)).clamp_min(0)
-        return Common(gain, steady - (whole - steady) / count, sum(levels) / count)
+        steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
+        spread = (whole - steady) / count
+        # Wiener's factor of the mean: its power over that with its error.
+        reliability = steady / (steady + spread).clamp_min(1e-300)
+        explained = steady * reliability
+        # The direct wave stays: unsure as its gain may be, its shape is right.
+        reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
+        return Common(gain * reliability, explained, sum(levels) / count)
 
     def at(self, prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
-        direct, away = prior.get(Direct), _away(prior, at.slot)
-        before = self.level / away**2 * prior.variance(at)
-        wave = (
-            torch.zeros(len(at.places), dtype=torch.complex128) if direct is None else direct.wave(at) / away
-        )
-        return self.gain * wave, (before - self.explained * wave.abs().square()).clamp_min(0), before
+        before = self.level / _away(prior, at.slot) ** 2 * prior.variance(at)
+        waves, _, away = _waves(prior, at)
+        waves = waves / away[:, None]
+        after = before - self.explained @ waves.abs().square()
+        return self.gain @ waves, after.clamp_min(0), before
+
+
+def _waves(prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
+    """Waves (J, n) of an end and its images, powers (J,) of fixed gains and distances to the middle (J,)."""
+    terms = [term for term in prior.terms if isinstance(term, Spherical)]
+    if not terms:
+        none = at.places.new_zeros(0)
+        return at.places.new_zeros(0, len(at.places), dtype=torch.complex128), none, none
+    each = [(term.waves(at), term.gains[0], term.away(at.slot)) for term in terms]
+    waves, power, away = (torch.cat(parts) for parts in zip(*each, strict=True))
+    return waves, power, away
 
 
 def _away(prior: ChannelPrior, slot: Slot) -> Tensor:
     """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
     direct = prior.get(Direct)
-    return torch.ones((), dtype=torch.float64) if direct is None else direct.away(slot)
+    return torch.ones((), dtype=torch.float64) if direct is None else direct.away(slot)[0]

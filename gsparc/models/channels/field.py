@@ -13,12 +13,13 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import At, Group, Slot, aligned, gather, query_ends, static_place
 from gsparc.models.channels.common import Common
 from gsparc.models.channels.initial import ChannelSettings, find_terms
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.terms import Direct
+from gsparc.models.channels.terms import Direct, Images
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
@@ -74,7 +75,7 @@ class Weights:
 
 
 class ChannelField(ClosedForm):
-    """Leakage, direct wave and a diffuse field of a static end and one that moves.
+    """Leakage, direct wave, images and a diffuse field of a static end and one that moves.
 
     Args:
         settings: terms that are tried.
@@ -108,16 +109,22 @@ class ChannelField(ClosedForm):
     @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.prior.get(Direct) is not None
+        return self.prior.get(Direct) is not None or self.size() > 0
 
     def size(self) -> int:
-        """Return 0: there are no Gaussians."""
-        return 0
+        """Return the number of images."""
+        images = self.prior.get(Images)
+        return 0 if images is None else len(images.planes)
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `drift`."""
+        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `mirrors`, `drift`."""
         return tuple(term.name for term in self.prior.terms if term.name)
+
+    def objects(self) -> SiteObjects:
+        """Return the mirror planes that static ends share."""
+        images = self.prior.get(Images)
+        return SiteObjects.of(planes=None if images is None else images.planes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; factors of runs are estimated by likelihood where there are several.
@@ -165,20 +172,23 @@ class ChannelField(ClosedForm):
             self._answer(moving[part], static[part], turned[part], station[part], dtype)
             for part in torch.arange(len(moving)).split(max(CHUNK // longest, 1))
         ]
-        mean, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
+        mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
             mean.to(device),
             after.to(dtype).to(device),
             (after / before.clamp_min(1e-300)).clamp(0, 1).to(dtype).to(device),
+            share.to(device) if self.size() else None,
         )
         return self.runs.restored(told, query.run)
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
-        prior, size = self.prior, math.prod(self.channel)
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
+        prior, images, size = self.prior, self.prior.get(Images), math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
+        # Without images it is not told, and needs no memory of its own.
+        share = mean if images is None else torch.zeros_like(mean)
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
 
@@ -192,6 +202,8 @@ class ChannelField(ClosedForm):
             asked = [At(known.group.slot, places) for known, _, places in alike]
             crosses = prior.together(asked, [known.group for known, _, _ in alike])
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
+                if images is not None:
+                    at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
                 removed = known.given.known(cross) if exact else known.learned(cross)
                 whole = prior.variance(at) + prior.disturbed
@@ -209,7 +221,7 @@ class ChannelField(ClosedForm):
                 at = At(slot, slot.places(moving[here], turned[here]))
                 common, left, whole = self.common.at(prior, at)
                 tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
-        return mean, after, before
+        return mean, share, after, before
 
     def _by_places(
         self, moving: Tensor, turned: Tensor, station: Tensor

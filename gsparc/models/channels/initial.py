@@ -30,9 +30,10 @@ from gsparc.models.channels.evidence import (
     without,
 )
 from gsparc.models.channels.kernels import cells, directions, plain
+from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import best_offset
-from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms import Direct, Directions, Images, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.compressed import Cache
 from gsparc.models.channels.terms.term import Frame
 from gsparc.models.run_factors import RunFactors
@@ -52,8 +53,10 @@ ALIGNED = (
 FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
+LEAST = 1e-3  # of all powers: sources below are dropped
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
+ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
@@ -74,6 +77,7 @@ class ChannelSettings:
         tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
         narrow: concentration of each of these.
         knots: in that angle.
+        mirrors: planes that several static ends share, at most; 0 for none.
     """
 
     constant: bool = True
@@ -85,6 +89,7 @@ class ChannelSettings:
     tied: int = 64
     narrow: float = 16.0
     knots: int = 9
+    mirrors: int = 8
 
 
 @dataclass(frozen=True)
@@ -142,7 +147,7 @@ def find_terms(
 def factors_of_runs(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> RunFactors:
     """Return the factor of each run of channels at rows (n,), by the waves that explain them."""
     # Directions turn factors by a degree and double the seconds.
-    few = ChannelSettings(directions=False, correlated=False)
+    few = ChannelSettings(directions=False, correlated=False, mirrors=0)
     prior, _ = find_terms(data, rows, few, budget)
     runs, groups = np.unique(np.asarray(data.run)[rows]), thinned(gather(data, rows, True), COLUMNS, ALIGNED)
     covariances = [
@@ -224,6 +229,10 @@ class _Search:
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
             step(self._with_fixed(steps[-1], direct), "leakage and direct wave")
+        if wanted.mirrors and steps[-1].prior.get(Direct) and ends_of(self.every) > 1:
+            mirrored = self._with_mirrors(steps[-1])
+            if mirrored is not None:
+                step(mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})")
         if wanted.directions and one_end:
             step(self._with_directions(steps[-1]), "directions")
         if ends_of(self.every) > 1:
@@ -289,6 +298,23 @@ class _Search:
             return candidate
         moved = self._fitted(prior.framed(offset=offset))
         return moved if moved.nll < candidate.nll else candidate
+
+    def _with_mirrors(self, before: Candidate) -> Candidate | None:
+        """With images in planes that all ends share; None where none is found."""
+        prior = before.prior
+        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(prior)
+        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
+        most = self.settings.mirrors
+        planes = find_mirrors(rough, wide._compressed(prior), prior, self.wavelength, most)
+        if not len(planes):
+            return None
+        images = Images.of(prior.frame, planes, NEW * float(prior[Isotropic].power))
+        mirrored = self._fitted(prior.changed(images))
+        images, power = mirrored.prior[Images], mirrored.prior.power
+        heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
+        if bool(heard.all()) or not bool(heard.any()):
+            return mirrored
+        return self._fitted(mirrored.prior.changed(images.only(heard)))
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""

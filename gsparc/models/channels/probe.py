@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,12 +24,13 @@ NONE = 1e-12  # power of a wave that is left out
 
 @dataclass(frozen=True)
 class Probe:
-    """A group's inverse covariance for terms of rank one: (1 - B B^T) / noise + F F^H.
+    """A group's inverse covariance for terms of rank one: (1 - B B^T) / noise + F F^H - T T^H.
 
     Attributes:
         group: whose, with targets of unit mean square.
         basis: B (n, r) complex128, outside of which there is noise alone.
         root: F (n, r) complex128.
+        downdate: T (n, t) complex128, of the waves that were added.
         alpha: (n, D) complex128, the inverse times the targets.
         noise, scale: the group's own powers.
     """
@@ -36,6 +38,7 @@ class Probe:
     group: Group
     basis: Tensor
     root: Tensor
+    downdate: Tensor
     alpha: Tensor
     noise: float
     scale: float
@@ -47,18 +50,46 @@ class Probe:
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
-        return Probe(part.group, basis, root, alpha, noise, at.scale)
+        return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
     def known(self, waves: Tensor) -> Tensor:
         """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
-        inside, basis = ((waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis))
-        return inside + (waves.abs().square().sum(1) - basis).clamp_min(0) / self.noise
+        inside, basis, downdate = (
+            (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
+        )
+        outside = waves.abs().square().sum(1) - basis
+        return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
-    def gain(self, waves: Tensor, level: float) -> Tensor:
-        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power."""
+    def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
+        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
+
+        `known` (m,) stands in for `known(waves)`.
+        """
         inner = (waves.conj() @ self.alpha).abs().square().sum(1)
-        size = 1 + level * self.known(waves)
+        size = 1 + level * (self.known(waves) if known is None else known)
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
+
+    def added(self, wave: Tensor, level: float) -> Probe:
+        """Return the probe with a wave (n,) of some power among the terms."""
+        own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
+        own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
+        share = level / (1 + level * float((wave.conj() @ own).real))
+        alpha = self.alpha - share * own[:, None] * (wave.conj() @ self.alpha)[None]
+        return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * own[:, None]], 1))
+
+
+def summed_gains(
+    probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
+    known: Callable[[Probe, Tensor], Tensor] = Probe.known,
+) -> Tensor:  # fmt: skip
+    """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
+    total = torch.zeros(count, len(levels), dtype=torch.float64)
+    for probe in probes:
+        for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
+            each = waves(probe, chunk)
+            size = known(probe, each)
+            total[chunk] += torch.stack([probe.gain(each, level, size) for level in levels], 1)
+    return total
 
 
 def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
@@ -71,13 +102,12 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
     probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:
+        def waves(probe: Probe, chunk: Tensor) -> Tensor:
+            moved = (replace(direct, frame=replace(direct.frame, offset=offset)) for offset in offsets[chunk])
+            return torch.cat([at.waves(probe.group) for at in moved])
+
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        moved = [replace(direct, frame=replace(direct.frame, offset=offset)) for offset in offsets]
-        for probe in probes:
-            for chunk in torch.arange(len(moved)).split(max(CHUNK // len(probe.group), 1)):
-                waves = torch.stack([moved[i].wave(probe.group) for i in chunk.tolist()])
-                likely[chunk] += probe.gain(waves, level)
-        return likely
+        return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
 
     best, step = torch.zeros(3, dtype=torch.float64), REACH * wavelength / COARSE
     near = torch.arange(-1, 2, dtype=torch.float64)

@@ -20,7 +20,7 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import cells, directed, directions, sphere
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.terms import Direct, Directions, Drift, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.ops import Pose
 from gsparc.processes.left_out import groups_of
@@ -45,19 +45,21 @@ def _sent(count=90, *, seed=0, direct=1.0, leakage=0.5, diffuse=0.0, noise=0.05,
     return from_arrays({**arrays, "frequency_hz": np.array([2.4e9])})
 
 
-def _prior(data, *, correlated=False, angles=4, envelope=0.4):
+def _prior(data, *, correlated=False, mirrors=1, angles=4, envelope=0.4):
     """Every term."""
     frame = Frame(
         torch.from_numpy(data.moving).mean(0), 20.0, envelope, 0.3, torch.tensor([0.01, -0.02, 0.0]).double()
     )
-    sizes = [1, angles, 1, 2, 2, 1, 2 * correlated]
+    planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]  # beneath everything
+    sizes = [1, angles, 1, 2, 2 * mirrors, 1, 2 * correlated]
     power = torch.rand(sum(sizes), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
-    isotropic, unequal, leakage, direct, _, noise, drift = power.split(sizes)
+    isotropic, unequal, leakage, direct, images, noise, drift = power.split(sizes)
     return ChannelPrior(()).changed(
         Isotropic(frame, isotropic),
         Directions(frame, unequal, angles=sphere(angles), concentration=5.0),
         Leakage(frame, leakage),
         Direct(frame, direct),
+        Images(frame, images, planes=planes),
         Noise(frame, noise),
         Drift(frame, drift),
     )
@@ -200,7 +202,7 @@ def test_left_out_is_what_refitting_gives(correlated):
 
 def test_far_away_nothing_is_known():
     data = _sent(60)
-    field = _whole(data)
+    field = _whole(data, mirrors=0)
     far = Pose(torch.tensor([3e4, 0.0, 0.0]), torch.eye(3))
     found = field.predict(Query(torch.from_numpy(data.tx[:1]).float(), far))
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
@@ -214,7 +216,7 @@ def test_far_away_nothing_is_known():
 @pytest.mark.parametrize("plain", [False, True])
 def test_variances_have_the_digits_they_need(noise, plain):
     data, dtype = _sent(60), torch.float64 if noise < 1e-3 else torch.float32
-    prior = _prior(data, angles=0 if plain else 4)
+    prior = _prior(data, mirrors=0, angles=0 if plain else 4)
     prior = prior.changed(replace(prior[Noise], power=torch.full((1,), noise).double()))
     if plain:
         prior = prior.changed(replace(prior[Direct], power=torch.zeros(0).double()))

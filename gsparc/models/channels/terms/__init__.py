@@ -7,10 +7,11 @@ tried in `gsparc.models.channels.initial`.
 from gsparc.models.channels.terms.direct import Direct
 from gsparc.models.channels.terms.directions import Directions
 from gsparc.models.channels.terms.drift import Drift
+from gsparc.models.channels.terms.images import Images
 from gsparc.models.channels.terms.isotropic import Isotropic
 from gsparc.models.channels.terms.leakage import Leakage
 from gsparc.models.channels.terms.noise import Noise
 
-__all__ = ["KINDS", "Direct", "Directions", "Drift", "Isotropic", "Leakage", "Noise"]
+__all__ = ["KINDS", "Direct", "Directions", "Drift", "Images", "Isotropic", "Leakage", "Noise"]
 
-KINDS = (Isotropic, Directions, Leakage, Direct, Noise, Drift)  # in the order of their powers
+KINDS = (Isotropic, Directions, Leakage, Direct, Images, Noise, Drift)  # in the order of their powers

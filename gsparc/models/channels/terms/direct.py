@@ -1,7 +1,4 @@
-"""The direct wave of a static end, or between two ends that move: `R p a a^H + S s a a^H`.
-
-R and S are squared exponentials of gains: one that only ends far outside, and one of gains that vary.
-"""
+"""The direct wave of a static end, or between two ends that move."""
 
 from __future__ import annotations
 
@@ -12,46 +9,28 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import At, Slot
-from gsparc.models.channels.kernels import smooth, steering
-from gsparc.models.channels.terms.compressed import Basis, Piece
-from gsparc.models.channels.terms.term import ChannelTerm
-from gsparc.processes.kernel import apart
+from gsparc.models.channels.kernels import steering
+from gsparc.models.channels.terms.spherical import Spherical
 
 
 @dataclass(frozen=True)
-class Direct(ChannelTerm):
-    """One spherical wave; powers (2,) of its fixed gain, then of one that varies."""
+class Direct(Spherical):
+    """One spherical wave."""
 
     name = "direct"
 
-    def away(self, slot: Slot) -> Tensor:
-        """Return the distance () [m] from the end to the places' middle."""
-        return torch.linalg.vector_norm(slot.end + self.frame.offset - self.frame.middle)
+    def sources(self, slot: Slot) -> Tensor:
+        """Return the end (1, 3) [m], see `Spherical`."""
+        return (slot.end + self.frame.offset)[None]
 
-    def wave(self, at: At) -> Tensor:
-        """Return it (n,) complex128, of size 1 in the middle; of places (n, 6), from one end to the other."""
-        wavenumber = at.slot.wavenumber
+    def waves(self, at: At) -> Tensor:
+        """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
         if at.places.shape[1] == 3:
-            return steering(at.places, at.slot.end + self.frame.offset, wavenumber, self.away(at.slot))
-        middle = self.frame.middle[:3] - self.frame.middle[3:]
+            return super().waves(at)
+        middle, wavenumber = self.frame.middle[:3] - self.frame.middle[3:], at.slot.wavenumber
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)
         between = at.places[:, :3] - at.places[:, 3:]
-        return steering(between, torch.zeros_like(middle), wavenumber, away)
-
-    def covariance(self, a: At, b: At) -> Tensor:
-        """Return that of both gains (n, m) complex128, see `Term`."""
-        distance, (fixed, varying) = apart(a.places, b.places), self.power
-        gains = fixed * smooth(distance, self.frame.reach) + varying * smooth(distance, self.frame.gain)
-        return gains * (self.wave(a)[:, None] * self.wave(b).conj())
-
-    def variance(self, a: At) -> Tensor:
-        """Return that of both gains (n,), see `Term`."""
-        return self.power.sum() * self.wave(a).abs().square()
-
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
-        """Return that of the fixed gain, then of the one that varies, see `ChannelTerm`."""
-        wave, frame = self.wave(at)[None], self.frame
-        return basis.factored(frame.reach, wave) + basis.factored(frame.gain, wave)
+        return steering(between, torch.zeros_like(middle), wavenumber, away)[None]
 
     @property
     def worth(self) -> int:

@@ -1,0 +1,59 @@
+"""Spherical waves: `R sum_n p_n a_n a_n^H + S sum_n s_n a_n a_n^H`.
+
+R and S are squared exponentials of gains: one that only ends far outside, and one of gains that vary.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.models.channels.columns import At, Slot
+from gsparc.models.channels.kernels import smooth, steering
+from gsparc.models.channels.terms.compressed import Basis, Piece
+from gsparc.models.channels.terms.term import ChannelTerm
+from gsparc.processes.kernel import apart
+
+
+@dataclass(frozen=True)
+class Spherical(ChannelTerm):
+    """W waves; powers (2W,) of their fixed gains, then of those that vary."""
+
+    @abstractmethod
+    def sources(self, slot: Slot) -> Tensor:
+        """Return where waves come from (W, 3) [m]."""
+
+    def away(self, slot: Slot) -> Tensor:
+        """Return distances (W,) [m] from sources to the places' middle."""
+        return torch.linalg.vector_norm(self.sources(slot) - self.frame.middle, dim=-1)
+
+    def waves(self, at: At) -> Tensor:
+        """Return each wave (W, n) complex128, of size 1 in the middle."""
+        sources, wavenumber = self.sources(at.slot), at.slot.wavenumber
+        both = zip(sources, torch.linalg.vector_norm(sources - self.frame.middle, dim=-1), strict=True)
+        return torch.stack([steering(at.places, one, wavenumber, away) for one, away in both])
+
+    @property
+    def gains(self) -> tuple[Tensor, Tensor]:
+        """Powers (W,) of fixed gains, and of those that vary."""
+        # In the order of `pieces`: fixed gains of all waves, then varying ones.
+        fixed, varying = self.power.view(2, -1)
+        return fixed, varying
+
+    def covariance(self, a: At, b: At) -> Tensor:
+        """Return that of all waves (n, m) complex128, see `Term`."""
+        distance, before, after = apart(a.places, b.places), self.waves(a), self.waves(b)
+        fixed, varying = ((before.T * power) @ after.conj() for power in self.gains)
+        return fixed * smooth(distance, self.frame.reach) + varying * smooth(distance, self.frame.gain)
+
+    def variance(self, a: At) -> Tensor:
+        """Return that of all waves (n,), see `Term`."""
+        return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
+
+    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+        """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
+        waves, frame = self.waves(at), self.frame
+        return basis.factored(frame.reach, waves) + basis.factored(frame.gain, waves)
