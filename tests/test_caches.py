@@ -3,11 +3,13 @@
 from dataclasses import asdict, fields, replace
 
 import numpy as np
+import pytest
 
 from gsparc.data.assemble import identity
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation.experiment.done import content
+from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.ops import SphereGrid
@@ -25,21 +27,36 @@ FACTS = {
 }  # fmt: skip
 
 
-def _keys(data) -> dict[str, str]:
+class Asked(Exception):
+    """Carries the key that was looked for."""
+
+
+def _keys(data, monkeypatch) -> dict[str, str]:
     """The name under which each cache keeps what it finds of these data."""
-    searches = str(ImageSourceGP()._depends_on(data, np.arange(len(data))))
-    return {"searches": searches, "cells": content(data)}
+
+    def asked(key):
+        raise Asked(key)
+
+    monkeypatch.setattr(vector_cache, "_kept", asked)
+    found = {}
+    rows = np.arange(len(data))
+    with pytest.raises(Asked) as key_of_vectors:
+        vector_cache.recovered(data, rows)
+    found["vectors"] = str(key_of_vectors.value)
+    found["searches"] = str(ImageSourceGP()._depends_on(data, rows))
+    found["cells"] = content(data)
+    return found
 
 
-def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign):
+def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, monkeypatch):
     """Of another `grid_deg` or `normalisation` a comparison showed the kept 32.4169 dB for 32.3799."""
     assert set(FACTS) == {one.name for one in fields(Site)}, "a new fact of a site is to be named here"
     data = campaign("spectrum", 20)
-    before = _keys(data)
-    assert before == _keys(replace(data))
+    before = _keys(data, monkeypatch)
+    assert before == _keys(replace(data), monkeypatch)
     for name, value in FACTS.items():
         other = replace(data, site=replace(data.site, **{name: value}))
-        after = _keys(other)
+        after = _keys(other, monkeypatch)
         same = [cache for cache in before if before[cache] == after[cache]]
         assert not same, f"{name}: {same}"
     for renamed in (("one", "three"), ("two", "one")):

@@ -27,7 +27,8 @@ class Effort:
         station_rows: that are learned from in each of them.
         fringes: coherent solutions of powers.
         restarts: of spectra that no neighbour solves, times the starts of each.
-        steps: of gradient from random weights, where neither model nor Trainer is given a number.
+        steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number; after a
+            start in closed form.
     """
 
     chosen_on: int = 1_000
@@ -38,6 +39,7 @@ class Effort:
     fringes: int = 20
     restarts: int = 100_000
     steps: int = 400
+    steps_after_solving: int = 60
 
     def times(self, factor: float) -> Effort:
         """Return all of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""

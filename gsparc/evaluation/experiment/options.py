@@ -29,7 +29,7 @@ RENDERED = (  # settings of the model that only rasterized Gaussians have
 ALONE = "a plain process has all the weight: model=splat is the field alone, and "
 ALONE += "model.effects.residual=false leaves the process out"
 REDRAW = "the dataset names its test rows: say split.redraw=true"
-STEPS = "no gradient steps are asked for: say trainer.max_steps=N"
+STEPS = "no gradient steps are asked for: say model.steps=auto"
 NAMES = ("_target_", "name", "guesses")  # settings that say nothing of what is done
 
 

@@ -9,7 +9,7 @@ unknown share.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -25,14 +25,15 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.array_vectors.cross_validation import tune
+from gsparc.models.array_vectors.vector_cache import recovered, report
 from gsparc.models.array_vectors.vector_gp import aligned_by, aligned_to, mirror_elements
-from gsparc.models.array_vectors.vectors_of_rows import recovered, report
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
 from gsparc.processes.features import whitened
 from gsparc.processes.neighbourhood import covering
+from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class Learned:
         background: (H, W) float32, the mean spectrum.
         error: level and power of the field's `ErrorModel`.
         left_out: training spectra predicted without their neighbours; None for too few.
+        elapsed, training: time of phase retrieval in this run, and when it was computed.
     """
 
     prior: Prior
@@ -57,6 +59,8 @@ class Learned:
     background: Tensor
     error: tuple[float, float]
     left_out: LeftOut | None
+    elapsed: Spent
+    training: Spent
 
 
 def through_array(task: InitTask) -> Start:
@@ -72,12 +76,14 @@ def through_array(task: InitTask) -> Start:
             "model.attenuation.inverse_distance=false"
         )
     process = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
-    solve = partial(start, process=process, receiver=task.receiver)
-    return Start(process.prior, solve, process.left_out)
+    return Start(
+        process.prior, partial(start, process=process, receiver=task.receiver), astuple(process.training),
+        astuple(process.elapsed), process.left_out,
+    )  # fmt: skip
 
 
 def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Learned:
-    """Retrieve the vectors of the given rows and fit their process.
+    """Retrieve the vectors of the given rows (cached where known) and fit their process.
 
     Args:
         data: spectra of a static array.
@@ -94,8 +100,9 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
     if not len(rows):
         raise ValueError("the training set is empty")
-    array, grid, wavelength = site.array_geometry()
-    recovery = recovered(data, rows, seed)
+    (array, grid, wavelength), watch = site.array_geometry(), TimeBudget()
+    recovery, training = recovered(data, rows, seed)
+    elapsed = watch.counted
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(array, grid, wavelength).numpy()
@@ -125,6 +132,8 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
         fit_errors(tuned.unknown, tuned.error),
         tuned.left_out,
+        elapsed,
+        training,
     )
 
 

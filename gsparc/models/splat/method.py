@@ -29,7 +29,7 @@ from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import InitSettings, InitTask
-from gsparc.field.keep_best import KeepBest, StopAt
+from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.module import GaussianModule, LossSettings, squared_error
 from gsparc.field.optimizer import OptimizerSettings
@@ -67,8 +67,9 @@ class LearnedField(Method):
         init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best look at validation rows, the start among them.
-        steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: none after
-            a start in closed form, else 400. 0 of either is the start alone.
+        steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60 after a
+            start in closed form, else 400, fewer where the first looks show no gain (`KeepBest`). 0 of
+            either is the start alone.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -113,6 +114,7 @@ class LearnedField(Method):
         self._paying: int | None = None  # position in the schedule after which steps did not pay
         self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
         self.init_s: float | None = None  # of all initialisers; None of a model read back
+        self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
@@ -148,12 +150,11 @@ class LearnedField(Method):
         self.steps_taken = int(marks.get("taken", 0))
         self.spent, self._apart = {}, _apart(data, fold)
         self._left_out = restored(marks.get("left_out"))  # an interrupted run's start is not repeated
-        self._limited_by = marks.get("limited_by")
+        self._billed, self._limited_by = Spent(), marks.get("limited_by")
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
         asked = steps_asked_for(context, len(watched.train), self.most_steps)
-        # After a start in closed form they gain nothing and take most seconds (docs/results/parts.csv).
-        usual = 0 if solved else budget.effort.steps
+        usual = budget.effort.steps_after_solving if solved else budget.effort.steps
         steps = usual if asked is None else asked
         log.info(
             "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
@@ -162,7 +163,11 @@ class LearnedField(Method):
         watching = not self.keep_best or len(watched.val) > 0 or not solved
         if stage == "train":
             if steps and watching:
-                seconds += self._stage("train", origin, data, watched, context, budget, seconds, steps)
+                # Steps that somebody asks for are all taken.
+                patience = PATIENCE if asked is None else None
+                seconds += self._stage(
+                    "train", origin, data, watched, context, budget, seconds, steps, patience
+                )
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
@@ -179,7 +184,7 @@ class LearnedField(Method):
             again = context.within("refit", resume=resume)
             known = self.fitted().confidence, self.fitted().error
             kept = self.model, self.steps, self._prior
-            self._stage("refit", origin, data, every, again, budget, seconds, steps, *known)
+            self._stage("refit", origin, data, every, again, budget, seconds, steps, None, *known)
             if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
         return self._ended(context, budget)
@@ -208,7 +213,7 @@ class LearnedField(Method):
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, earlier_s: float, steps: int,
+        budget: TimeBudget, earlier_s: float, steps: int, patience: int | None = None,
         confidence: Confidence | None = None, error: ErrorModel | None = None,
     ) -> float:  # fmt: skip
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
@@ -216,6 +221,7 @@ class LearnedField(Method):
         Args:
             stage: `train`, `refit` or `final`, which takes no steps.
             steps: of the schedule.
+            patience: see `KeepBest`.
             confidence, error: of an earlier stage, told by rows that this one learns from.
         """
         folder, resume = context.run_dir, context.resume
@@ -234,7 +240,11 @@ class LearnedField(Method):
             )  # fmt: skip
             self._prior = start.prior
             self.model = self._new_model(data.site)
-            self._left_out = start.solve(self.model) or start.left_out
+            solved = start.solve(self.model)
+            self._left_out = solved or start.left_out
+            # What an earlier run has paid for is billed; what an earlier stage has, is not again.
+            budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
+            self._billed = Spent(*start.billed_s)
         else:
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:
@@ -266,7 +276,7 @@ class LearnedField(Method):
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         watch: list[L.Callback] = []
         if self.keep_best and stage == "train":
-            watch.append(KeepBest())
+            watch.append(KeepBest(patience))
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
         heeded.count("dataset.batch_size")

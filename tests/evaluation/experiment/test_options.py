@@ -232,7 +232,7 @@ def test_callbacks_of_a_training_without_steps(none, caplog):
     given = "callbacks.densify.start=0.2", "callbacks=early_stopping", "trainer.max_time=00:00:01:00"
     unused, _ = fitted("array", "model=gsparc", none, *given)
     assert unused == {"callbacks.densify.start", "callbacks", "trainer.max_time"}
-    assert warned(caplog)[0].endswith("(no gradient steps are asked for: say trainer.max_steps=N)")
+    assert warned(caplog)[0].endswith("(no gradient steps are asked for: say model.steps=auto)")
 
 
 def test_steps_that_closed_forms_do_not_take(caplog):

@@ -11,7 +11,7 @@ from known_arrays import array_site, measure, room_vectors, spectra, walk
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
-from gsparc.models.array_vectors import phase_retrieval, vectors_of_rows
+from gsparc.models.array_vectors import phase_retrieval, vector_cache
 from gsparc.models.array_vectors.phase_retrieval import recover
 from gsparc.models.array_vectors.vector_gp import mirror_elements, twin
 from gsparc.ops import SphereGrid
@@ -78,16 +78,23 @@ def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, r
     assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
 
 
-def test_only_requested_rows_are_recovered_some_at_a_time(known_campaign, monkeypatch):
+def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeypatch, caplog):
+    caplog.set_level("INFO", "gsparc")
     data, _ = known_campaign
-    asked, inner = [], vectors_of_rows.recover
-    monkeypatch.setattr(vectors_of_rows, "AT_ONCE", 10)
-    monkeypatch.setattr(vectors_of_rows, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
-    found = vectors_of_rows.recovered(data, np.arange(5, 23))
-    assert asked == [9, 9] and len(found.vectors) == len(found.residual) == 18
-    np.testing.assert_array_equal(
-        found.vectors[:9], vectors_of_rows.recovered(data, np.arange(5, 14)).vectors
-    )
+    data = replace(data, site=replace(data.site, sha256="fresh"))
+    asked, inner = [], vector_cache.recover
+    monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
+    monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
+    first, seconds = vector_cache.recovered(data, np.arange(10))
+    again, later = vector_cache.recovered(data, np.arange(5, 25))
+    assert asked == [10, 8, 7] and seconds.wall > 0 and later.wall > seconds.wall / 2
+    assert seconds.processor > 0 and seconds.processor / 2 < later.processor
+    np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
+    assert "array vectors of 5 spectra were computed before" in caplog.messages
+    other = replace(data, site=replace(data.site, sha256="another"))
+    vector_cache.recovered(other, np.arange(3))
+    vector_cache.recovered(other, np.arange(3), seed=1)
+    assert asked == [10, 8, 7, 3, 3]
 
 
 def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
@@ -95,7 +102,7 @@ def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     broken, rows = _spoilt(data, 2), np.arange(4)
     found = recover(data.site, broken.target[rows], data.tx[rows], most=0)
     assert np.flatnonzero(found.suspect).tolist() == [2]
-    vectors_of_rows.report(found, broken, rows, tmp_path / "array_recovery.csv")
+    vector_cache.report(found, broken, rows, tmp_path / "array_recovery.csv")
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
     assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
 

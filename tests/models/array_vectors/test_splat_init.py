@@ -16,8 +16,8 @@ from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import tune
+from gsparc.models.array_vectors.vector_cache import recovered
 from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements
-from gsparc.models.array_vectors.vectors_of_rows import recovered
 from gsparc.models.registry import build
 from gsparc.physics.array_response import steering
 
@@ -48,7 +48,7 @@ def process(trained):
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
-    found = recovered(data, fold.train)  # the same solutions
+    found, _ = recovered(data, fold.train)  # the same solutions
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = aligned_by(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])

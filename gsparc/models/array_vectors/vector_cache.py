@@ -1,0 +1,77 @@
+"""Retrieved array vectors of a dataset, each solved once in a process, and their report."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from dataclasses import fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.assemble import identity
+from gsparc.data.schema import Measurements
+from gsparc.models.array_vectors.phase_retrieval import Recovered, recover
+from gsparc.models.target_rows import training_targets
+from gsparc.training.time_budget import Spent, TimeBudget
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 1024  # rows solved together, which bounds the memory
+NAMED = 8  # suspect images named in a log line
+
+
+@lru_cache(maxsize=1)
+def _kept(key: str) -> dict[int, tuple[Any, ...]]:
+    """By row of the data last asked for what is known of it: its parts of `Recovered`, and seconds."""
+    return {}
+
+
+def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Recovered, Spent]:
+    """Return array vectors of the given rows, and the seconds they took when computed.
+
+    Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
+    process has solved for the same data, as a refit's are, are not solved again.
+
+    Args:
+        data: spectra of a static array.
+        rows: (n,) sorted.
+        seed: of the random starts.
+    """
+    known, names = _kept(f"{identity(data)} {seed}"), [one.name for one in fields(Recovered)]
+    missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
+    if len(missing) < len(rows):
+        log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
+    for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
+        watch = TimeBudget()
+        recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)
+        spent = np.tile([*vars(watch.counted).values()], (len(part), 1)) / len(part)
+        parts = zip(*(getattr(recovery, name) for name in names), spent, strict=True)
+        known.update(zip(part.tolist(), parts, strict=True))
+    *columns, seconds = (np.stack(part) for part in zip(*(known[row] for row in rows.tolist()), strict=True))
+    return Recovered(*columns), Spent(*seconds.sum(0).tolist())
+
+
+def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
+    """Write the residual of each image as CSV and log the suspect ones."""
+    names = data.row_names or [f"row {i}" for i in range(len(data))]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["row", "name", "residual", "outside_the_array", "quantisation", "suspect"])
+        for i, row in enumerate(rows):
+            figures = (result.residual[i], result.floor[i], result.expected[i])
+            writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.suspect[i])])
+    bad = rows[result.suspect]
+    log.info(
+        "array vectors of %d spectra: median residual %.1e, quantisation %.1e",
+        len(rows), np.median(result.residual), np.median(result.expected),
+    )  # fmt: skip
+    if len(bad):
+        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        log.warning(
+            "%d spectra do not fit this array (see %s): %s%s",
+            len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
+        )  # fmt: skip
