@@ -52,7 +52,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = method.contributions(data, learned)
-    settings = list(combinations(method, plain(config.grid), plain(config.singles)))
+    settings = list(combinations(method, plain(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))

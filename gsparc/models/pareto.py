@@ -13,7 +13,6 @@ Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as t
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
     "stride": lambda value: f"1 of {value} x {value} pixels",
-    "projection": lambda value: f"{value} projection",
     "confidence": lambda value: "" if value else "no confidence",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
 }

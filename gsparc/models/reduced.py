@@ -28,15 +28,12 @@ def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
     return method.reduced(settings, measured) if settings else method
 
 
-def combinations(
-    method: Method, grid: Mapping[str, Sequence[Any] | None], singles: Mapping[str, Sequence[Any]]
-) -> Iterator[dict[str, Any]]:
-    """Yield settings: none, each of `singles` alone, all combinations in `grid`, of knobs the method has.
+def combinations(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
+    """Yield settings: none, then all combinations in `grid` of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.
     """
     known = method.knobs()
-    single = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
     axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
     if "stride" in axes:
         axes["stride"] = _dividing(axes["stride"], method)
@@ -46,7 +43,7 @@ def combinations(
         for chosen in product(*axes.values())
     ]
     seen: list[dict[str, Any]] = []
-    for settings in ({}, *single, *together):
+    for settings in ({}, *together):
         if settings not in seen:
             seen.append(settings)
             yield settings

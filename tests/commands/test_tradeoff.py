@@ -30,7 +30,7 @@ def swept(field, tmp_path_factory):
     shutil.copy(field.checkpoints[0], ckpt)
     config = compose(
         f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
-        "grid.keep=[1.0,0.3]", "grid.stride=[1,2]",
+        "grid.stride=[1,2]",
         "baselines=[mean]", config="tradeoff",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
@@ -58,7 +58,7 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     facts, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == facts["tradeoff/points"] == 6  # as trained, 1 alone, 2 x 2 without confidence
+    assert len(rows) == facts["tradeoff/points"] == 3  # as trained, 2 without confidence
     times = [float(row["render_ms_p50"]) for row in rows]
     assert times == sorted(times) and all(
         float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True)
@@ -76,7 +76,7 @@ def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     _, _, ckpt, _ = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
     points, measured = operating_point.stored_points(after.extra)
-    assert points and "contribution" in measured and operating_point.stored_points(before.extra) == ([], {})
+    assert points and "receiver" in measured and operating_point.stored_points(before.extra) == ([], {})
     assert after.config == before.config and set(after.extra) == {*before.extra, operating_point.KEY}
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]

@@ -24,11 +24,10 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
-from gsparc.models.mixture import fit_candidates, residual
+from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import Powers
-from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation, for_stations
 from gsparc.models.registry import build, method_class
 from gsparc.models.splat.image_process import ImageProcess
@@ -215,17 +214,14 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
     assert fitted.processor_s < 1.3 * 3.0 + AFTER_S
 
 
-def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
+def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
     monkeypatch.setattr(solution_weights, "weights", lambda found, *unused: (1 / len(found),) * len(found))
-    monkeypatch.setattr(residual, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, budget_s=1e3)
     field = fitted.method
     assert sum(field.weights) == pytest.approx(1)
-    completed = [isinstance(member, Residual) and member.rest is not None for member in field.members]
-    assert completed == [False, True]
     assert fitted.method.facts()["model/init"] == "diffuse+sources" and field.count
     assert {"phase", "residual"} <= set(fitted.method.effects.split("+"))
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
@@ -278,7 +274,6 @@ def test_without_the_residual_gaussians_are_alone(name):
     batch = asked(fitted)
     found = method.predict(batch)
     torch.testing.assert_close(found.mean, found.explained)
-    assert not isinstance(method.only, Residual)
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
         ("gp", {"keep": 0.5, "confidence": False}),
         ("array", {"keep": 0.5}),
         ("moving_array", {"keep": 0.5}),
-        ("gsparc", {"keep": 0.5, "confidence": False}),
+        ("gsparc", {"stride": 2, "confidence": False}),
     ],
 )
 def test_a_reduction_leaves_the_method_as_it_was(name, settings):

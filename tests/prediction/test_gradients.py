@@ -28,7 +28,6 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.mixture.methods import Powers
-from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.per_station import for_stations
@@ -89,7 +88,7 @@ def planned(*more: str) -> Callable[[], MethodFactory]:
 
 
 class Assembled(Powers):
-    """What `method` found, with two processes of waves beside it where it is one of channels."""
+    """What `method` found, with a process of waves beside it where it is one of channels."""
 
     def __init__(self, method: ClosedForm) -> None:
         super().__init__()
@@ -99,13 +98,8 @@ class Assembled(Powers):
         self.site, report = data.site, self.method.fit(data, fold, context)
         self.members, self.weights = [self.method], (1.0,)
         if not isinstance(self.method, MovingArrayField):
-            waves = [
-                fitted_to(ChannelField(ChannelSettings(direct=direct)), data, fold.train)[0]
-                for direct in (True, False)
-            ]
-            sources = Residual(self.method)
-            sources.site, sources.rest, sources.share = data.site, waves[1], 0.3
-            self.members, self.weights = [sources, waves[0]], (0.6, 0.4)
+            waves, _ = fitted_to(ChannelField(ChannelSettings()), data, fold.train)
+            self.members, self.weights = [self.method, waves], (0.6, 0.4)
         return report
 
 

@@ -43,50 +43,17 @@ def mirror_elements(array: np.ndarray) -> np.ndarray | None:
 
 
 def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
-    """Return vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
+    """Return vectors (n, M) with twins and phases that match a neighbour's, along a tree of short steps.
 
-    Walks a minimum spanning tree of the positions (n, 3) [m]; each sample is compared with its four nearest
-    predecessors.
+    The tree is the minimum spanning one of the positions (n, 3) [m].
     """
-    n = len(vectors)
-    order = _walk(positions)
     aligned = np.array(vectors, dtype=np.complex128)
-    tree = cKDTree(positions)
-    done = np.zeros(n, dtype=bool)
-    done[order[0]] = True
-    for i in order[1:]:
-        near = _nearest_done(tree, positions, i, done, 4)
-        distance = np.linalg.norm(positions[near] - positions[i], axis=1)
-        # By distance alone: lengths of the neighbours' vectors are divided out.
-        weight = np.exp(-distance / max(distance[0], 1e-6)) / np.maximum(
-            np.linalg.norm(aligned[near], axis=1), 1e-12
-        )
-        choices = [aligned[i]] if partner is None else [aligned[i], twin(aligned[i], partner)]
-        overlaps = [aligned[near].conj() @ choice for choice in choices]
-        best = int(np.argmax([(weight * np.abs(overlap)).sum() for overlap in overlaps]))
-        turn = overlaps[best][0]
-        aligned[i] = choices[best] * (np.conj(turn) / abs(turn) if abs(turn) > 0 else 1.0)
-        done[i] = True
+    if len(aligned) > 1:
+        distance = cdist(positions, positions) + 1e-9  # zero would mean no edge
+        order, before = breadth_first_order(minimum_spanning_tree(distance), 0, directed=False)
+        for i in order[1:]:
+            aligned[i] = matched(aligned[i], aligned[before[i]], partner)
     return aligned
-
-
-def _walk(positions: np.ndarray) -> np.ndarray:
-    """Rows from the first along a spanning tree of short steps."""
-    if len(positions) == 1:
-        return np.zeros(1, dtype=np.int64)
-    distance = cdist(positions, positions) + 1e-9  # zero would mean no edge
-    tree = minimum_spanning_tree(distance)
-    return breadth_first_order(tree + tree.T, 0, directed=False, return_predecessors=False)
-
-
-def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray, count: int) -> np.ndarray:
-    reach = 4 * count
-    while True:
-        neighbours = np.atleast_1d(tree.query(positions[i], k=min(reach, len(positions)))[1])
-        near = neighbours[done[neighbours]]
-        if len(near) >= count or reach >= len(positions):
-            return near[:count]
-        reach *= 4
 
 
 def matched(

@@ -16,38 +16,35 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.directional.method import DirectionalGP, where_rays_meet
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.mixture.residual import Residual
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.training.context import FitContext
 
-# `(init, clutter, residual, context) -> method`: whether obstacles, and a process beside sources, are sought.
-Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
+# `(init, clutter, context) -> method`: whether obstacles are sought.
+Candidate = Callable[[InitSettings, bool, FitContext], ClosedForm]
 
 
-def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Return image sources of several searches, and a process on what they leave.
+def sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+    """Return image sources of several searches.
 
     Searches start where measured directions meet, but for `init=sources`, which is without them.
     """
     start = None if init.name == "sources" else partial(where_rays_meet, init.rows, context.seed)
-    method = ImageSourceGP(**_searched(init, clutter, context), start=start)
-    return Residual(method) if residual else method
+    return ImageSourceGP(**_searched(init, clutter, context), start=start)
 
 
-def scene(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+def scene(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return images of the static end in the walls of `init.file`.
 
     Raises:
         DataError: no such file, or walls that cannot be.
     """
-    method = KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
-    return Residual(method) if residual else method
+    return KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
 
 
-def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+def powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Make coherent waves, or losses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
@@ -57,12 +54,12 @@ def powers(init: InitSettings, clutter: bool, residual: bool, context: FitContex
     return PowerField(init.name != "diffuse", context.seed, walls, context.terms)
 
 
-def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+def joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return powers of several stations in one process; without `clutter` they share their law alone."""
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
-def bearings(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
+def bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return sources where bearings cross, of at most `init.searches` searches."""
     search = replace(SearchSettings(), sources=init.max_sources)
     searches = max(round(init.searches * context.effort), 1)
@@ -83,7 +80,7 @@ def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[st
 CANDIDATES: dict[str, Candidate] = {
     "sources": sources,
     "scene": scene,
-    "rays": lambda init, clutter, residual, context: DirectionalGP(init.rows, context.seed),
+    "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed),
     "diffuse": lambda *unused: ChannelField(),
     "powers": powers,
     "joint_powers": joint_powers,

@@ -85,7 +85,7 @@ def fit_all(
             within = replace(within, leave_out=leave_out, race=race)
             with heeded.apart() as read[name], late_when(budget.over):
                 clutter = name not in CLUTTERED or effects.visibility is not False
-                field = parts[name](settings, clutter, effects.residual is not False, within)
+                field = parts[name](settings, clutter, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
             if name not in OPEN_ENDED:

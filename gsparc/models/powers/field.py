@@ -26,7 +26,7 @@ from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.own_terms import InWorld, learned
-from gsparc.models.powers.settings import candidates, chosen_among, mixture
+from gsparc.models.powers.settings import LAW_NEEDS, candidates, chosen_among, mixture
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
@@ -100,11 +100,14 @@ class PowerField(ClosedForm):
             one.check(torch.from_numpy(seen.places))
         if self.walls is not None:
             walls = counted(self.walls, site.origin, site.static_position)
-            law, notes = law_of(seen, site)
+            # A law goes through so few rows exactly, and leaves next to no variance.
+            told = int((~seen.silent).sum()) >= LAW_NEEDS
+            law, notes = law_of(seen, site) if told else (None, ())
             trend = replace(trend_of_rows(seen, law), more=(walls, *more))
             best = chosen_among(seen, [(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
-            note = f"losses in {len(walls.sizes)} known walls and floors, about a distance law"
+            about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
+            note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
             return (note, *notes, *best.notes)
         found, said = candidates(seen, site, self.seed, chosen_on, more), list[str]()
         self.priors = ((1.0, found[0].prior),)

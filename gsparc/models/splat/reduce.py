@@ -1,4 +1,4 @@
-"""What a splatted field can spare: Gaussians or places, pixels, the exact footprint, the confidence."""
+"""What a splatted field can spare: places that its features are told by, pixels, the confidence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field import edit
 from gsparc.field.encoding import PositionEncoding, Prior
 from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
@@ -20,15 +19,11 @@ from gsparc.field.response import ArrayResponse
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Filled, coarser
-from gsparc.ops import Pose, SphereGrid, mean_weights
+from gsparc.ops import Pose, SphereGrid
 from gsparc.processes.features import correlation, farthest, with_places
 
 if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
-
-RIDGE = 1e-5  # relative to the mean footprint energy; footprints overlap
-MOST_WEIGHTS = 25_000_000  # pixels times Gaussians held at once
-MOST_ROWS = 64  # positions over which a contribution is averaged
 
 
 def through_array(model: GaussianModel) -> bool:
@@ -42,35 +37,17 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, which `keep` is a share of, and pixels.
     """
-    if through_array(model):
-        return ("keep", "stride" if model.tells_unknown else "projection", "confidence")
-    return ("keep", "projection", "confidence", "stride")
+    if not through_array(model):
+        return ("confidence", "stride")
+    return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
 
 
-@torch.no_grad()
 def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """Return `contribution` (N,): what each Gaussian adds to predictions at training rows (n,) on average.
-
-    Its weight summed over the directions of the receiver times the size of its emission. `receiver` (4, 3) is
-    the pose of a static one, its position [m] above its rotation.
-    """
-    model = method.fitted()
-    chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int)]
-    total = torch.zeros(len(model.gaussians))
-    for row in chosen:
-        batch = data.batch(np.array([row]))
-        emitted = model.features(batch.tx, batch.rx).abs().sum(-1).mean(0)
-        total += emitted * _weights(model, batch.rx)
-    result = {"contribution": total / len(chosen)}
-    if model.site.static_end == "rx":
-        rx = data.batch(chosen[:1]).rx
-        result["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
-    return result
-
-
-def _weights(model: GaussianModel, rx: Pose) -> Tensor:
-    g = model.gaussians
-    return mean_weights(model.plan(rx), *g.geometry()).mean.reshape(-1, len(g))[0]
+    """Return `receiver` (4, 3), a static one's position [m] above its rotation; else nothing."""
+    if method.fitted().site.static_end != "rx":
+        return {}
+    rx = data.batch(rows[:1]).rx
+    return {"receiver": torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])}
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
@@ -78,31 +55,18 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
 
     Args:
         method: fitted.
-        settings: `keep` share of Gaussians, or of places, in (0, 1]; `stride` in pixels; `projection`;
-            `confidence` or not.
+        settings: `keep` share of places in (0, 1]; `stride` in pixels; `confidence` or not.
         measured: from `measure`.
     """
     twin = copy.copy(method)
     twin.model = model = copy.deepcopy(method.fitted())
     site, stride = model.site, int(settings.get("stride", 1))
     raster = model.settings.raster
-    raster = replace(
-        raster, projection=settings.get("projection", raster.projection),
-        low_pass=raster.low_pass / stride**2,  # as wide as before on the sky
-    )  # fmt: skip
+    raster = replace(raster, low_pass=raster.low_pass / stride**2)  # as wide as before on the sky
     model.settings = replace(model.settings, raster=raster)
     by_places = through_array(model) and model.tells_unknown
-    if "keep" in settings and by_places:
+    if "keep" in settings:
         distil_features(model, float(settings["keep"]))
-    elif "keep" in settings:
-        share, total = float(settings["keep"]), len(model.gaussians)
-        if _linear(model):
-            _keep(model, spread(model, measured)[: math.ceil(share * total)])
-            with torch.no_grad():
-                model.gaussians.log_scales.sub_(0.5 * math.log(share))  # together they cover as much sky
-            teach(model, method.fitted(), measured["receiver"])
-        else:
-            _keep(model, measured["contribution"].topk(math.ceil(share * total)).indices)
     if not settings.get("confidence", True):
         model.confidence = model.error = None
     model.gaussians.version += 1  # a plan frozen before is stale
@@ -132,68 +96,6 @@ def _frozen_again(
     assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
     renderer = response.every(stride, coarser(grid, stride)) if stride > 1 else None
     return frozen_array(model, view.view, renderer), grid
-
-
-def _keep(model: GaussianModel, rows: Tensor) -> None:
-    keep = torch.zeros(len(model.gaussians), dtype=torch.bool)
-    keep[rows] = True
-    edit.apply(edit.Edit(keep, torch.zeros(0, dtype=torch.long)), model, model.gaussians)
-
-
-def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
-    """Return rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
-
-    Each is the one farthest from all before it. What is kept is taught anew, so places count, not strengths:
-    an eighth of 2,000 Gaussians chosen by contribution leaves holes.
-    """
-    seen = torch.nn.functional.normalize(model.gaussians.means.detach() - measured["receiver"][0], dim=1)
-    order = [int(measured["contribution"].argmax())]
-    apart = 1 - seen @ seen[order[0]]
-    while len(order) < len(seen):
-        # Below every distance, so that what is chosen is not chosen again.
-        apart[order[-1]] = -1.0
-        order.append(int(apart.argmax()))
-        apart = torch.minimum(apart, 1 - seen @ seen[order[-1]])
-    return torch.tensor(order)
-
-
-def _linear(model: GaussianModel) -> bool:
-    """Whether images are linear in what the emission has learned: then fewer can be taught in closed form."""
-    emission = model.settings.emission
-    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-    plain = not model.settings.attenuation.inverse_distance and not through_array(model)
-    return static and plain and not emission.hidden and emission.activation == "linear"
-
-
-@torch.no_grad()
-def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
-    """Set emissions of `few` that come nearest to images of the whole field, at all positions at once.
-
-    Images are W E f(x) with weights W (pixels x Gaussians), read-outs E and features f: least squares over
-    the pixels gives E of the few from W E of all.
-    """
-    rx, grid = Pose(receiver[0], receiver[1:]), whole.site.grid
-    assert grid is not None
-    entries = grid.height * grid.width * len(whole.gaussians)
-    # The finest grid whose pixels times Gaussians fit in memory.
-    fitting = [s for s in (1, 2, 3, 4, 5) if grid.width % s == 0 and entries <= MOST_WEIGHTS * s**2]
-    grid = coarser(grid, fitting[0]) if fitting else grid
-    wanted = _weights_of(whole, rx, grid)
-    wanted = wanted @ torch.cat([whole.emission.weight2.squeeze(-1), whole.emission.bias2], 1)
-    own = _weights_of(few, rx, grid)
-    gram = own.mT @ own
-    gram.diagonal().add_(RIDGE * gram.diagonal().mean() + 1e-12)
-    result = torch.linalg.solve(gram, own.mT @ wanted)
-    few.emission.weight2.copy_(result[:, :-1, None])
-    few.emission.bias2.copy_(result[:, -1:])
-
-
-def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:
-    """(pixels, N)."""
-    view = copy.copy(model)
-    view.site = replace(model.site, grid=grid)
-    frozen = view.freeze(rx)
-    return frozen.render(torch.eye(len(model.gaussians)), frozen.version).flatten(1).mT
 
 
 @torch.no_grad()

@@ -160,6 +160,16 @@ def test_settings_are_chosen_on_rows_that_no_clock_counts():
     assert all(each.over() for each in chosen)
 
 
+def test_two_rows_behind_known_walls_were_known_to_a_thousandth_of_a_decibel(tmp_path):
+    """A distance law goes through both: variances of 7e-9 dB^2 at places that were missed by 8 dB."""
+    (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
+    data = town(40)
+    field, notes = fitted_to(PowerField(walls=read_walls(tmp_path / "town.yaml")), data, np.arange(2))
+    told = field.predict(data.batch(np.arange(2, 40)))
+    spread = told.variance.sqrt() / told.mean[:, 0] * 10 / math.log(10)
+    assert float(spread.min()) > 1.0 and "a constant, with fewer than 8 rows" in notes[0]
+
+
 @pytest.mark.parametrize("rows", [20, 60])
 def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
     data, rows, test = town(260), np.arange(rows), np.arange(160, 260)

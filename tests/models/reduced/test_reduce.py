@@ -25,7 +25,6 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.splat import reduce as field_reduce
 from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
 
@@ -81,34 +80,10 @@ def process(field) -> Case:
     return Case(method, field.data, field.fold, {})
 
 
-def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(field):
-    before, measured = field.answer().mean.clone(), field.measured["contribution"]
-    assert measured.shape == (40,) and (measured >= 0).all()
-    assert field.away(field.less(keep=1.0)) < 1e-3
-    half, few = (field.less(keep=share) for share in (0.5, 0.1))
-    assert half.size() == 20 and few.size() == 4 and field.method.size() == 40
-    assert field.away(half) < 0.2 < field.away(few)
-    assert torch.equal(field.answer().mean, before)
-
-
-def test_the_order_of_keeping_is_spread_over_the_sky(field):
-    method, measured = field.method, field.measured
-    order = field_reduce.spread(method.fitted(), measured)
-    assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
-    seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
-
-    def nearest(rows):
-        apart = torch.cdist(seen[rows], seen[rows])
-        return float((apart + 9 * torch.eye(len(rows))).min())
-
-    assert nearest(order[:8]) > 1.3 * nearest(torch.arange(8))
-
-
-@pytest.mark.parametrize(("settings", "near"), [({"stride": 2}, 0.1), ({"projection": "equirect"}, 0.5)])
-def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
-    lean = field.less(**settings)
+def test_what_a_splatted_field_spares_stays_near_it(field):
+    before, lean = field.answer().mean.clone(), field.less(stride=2)
     assert field.answer(lean).mean.shape == field.data.batch(field.fold.test).target.shape
-    assert field.away(lean) < near
+    assert field.away(lean) < 0.1 and torch.equal(field.answer().mean, before)
 
 
 def test_confidence_that_is_spared_is_not_computed(field):
@@ -192,23 +167,19 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(process, caplog):
     """The command's own default strides ended it on grids of 7 x 13."""
     columns = process.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(reduced.combinations(process.method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
+    assert list(reduced.combinations(process.method, {"stride": [1, 2, 3]})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.fold, FitContext(Path()))
-    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]}, {"projection": ["equirect"]})) == [{}]
+    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]})) == [{}]
     assert reduced.reduced(method, {"keep": 0.5}, {}) is method
 
 
-def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
+def test_rendered_channels_spare_directions(tmp_path):
     case = Case.trained(train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1])
-    strongest = case.less(keep=0.5)
-    weakest = case.less({"contribution": -case.measured["contribution"]}, keep=0.5)
-    assert strongest.size() == weakest.size() == 20
-    assert case.away(strongest) < case.away(weakest)
     assert case.away(case.less(stride=2)) < 0.2
 
 

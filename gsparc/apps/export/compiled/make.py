@@ -22,7 +22,6 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.mixture.residual import Residual
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.field import PowerField
 from gsparc.models.splat.image_process import ImageProcess
@@ -107,9 +106,6 @@ def exact_form(method: Method, site: Site) -> Form | None:
     """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
         return None if method.only is None else exact_form(method.only, site)
-    # The process beside sources has no form: where it has no share, the sources are the model.
-    if isinstance(method, Residual):
-        return exact_form(method.method, site) if method.rest is None or not method.share else None
     if isinstance(method, PowerField):
         if method.powers is None or method.fringes is not None:
             return None

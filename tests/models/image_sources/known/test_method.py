@@ -33,7 +33,7 @@ def room(tmp_path_factory):
 
 def fitted(name: str, data, rows: np.ndarray, **init):
     context = FitContext(budget_s=60.0)
-    method = CANDIDATES[name](InitSettings(name, searches=1, **init), True, True, context)
+    method = CANDIDATES[name](InitSettings(name, searches=1, **init), True, context)
     return method, method.fit(data, Fold(np.sort(rows), rows[:0], rows[:0]), context)
 
 
@@ -57,7 +57,7 @@ def test_known_walls_tell_all_from_few_rows(room):
 def test_without_visibility_every_image_is_seen_everywhere(room):
     _, data, fold, file = room
     settings = InitSettings("scene", file=str(file), order=1)
-    field = CANDIDATES["scene"](settings, False, False, FitContext())
+    field = CANDIDATES["scene"](settings, False, FitContext())
     fitted_to(field, data, fold.train[:40], budget_s=30.0)
     assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count == 7
 
