@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gsparc.data.walls import read_walls
@@ -13,7 +12,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.directional.method import DirectionalGP, where_rays_meet
+from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.mixture.residual import Residual
@@ -30,10 +29,11 @@ Candidate = Callable[[InitSettings, bool, bool, FitContext], ClosedForm]
 def sources(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
     """Return image sources of several searches, and a process on what they leave.
 
-    Searches start where measured directions meet, but for `init=sources`, which is without them.
+    Searches start where measured directions meet, where these were solved before.
     """
-    start = None if init.name == "sources" else partial(where_rays_meet, init.rows, context.seed)
-    method = ImageSourceGP(**_searched(init, clutter, context), start=start)
+    method = ImageSourceGP(**_searched(init, clutter, context))
+    if "rays" in context.beside:
+        method.start = context.beside["rays"].found()
     return Residual(method) if residual else method
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.residual import Residual
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.scene import Scene, steering
+from gsparc.models.image_sources.scene import BETAS, Scene, steering
 from gsparc.physics.mirror_planes import Reflections, images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
@@ -81,8 +81,7 @@ def descend(
     start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
-    # Shorter memories than Adam's usual ones, of a thousand steps.
-    optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
+    optimizer = torch.optim.Adam(groups, betas=BETAS)
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values

@@ -13,15 +13,14 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
-from gsparc.models.image_sources.ensemble import compact, left_out_error
+from gsparc.models.image_sources.ensemble import Look, Member, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
-from gsparc.models.image_sources.search import NOISE, SearchSettings
-from gsparc.models.image_sources.search_cache import Member, SearchCache
+from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
@@ -60,21 +59,21 @@ class KnownWallsGP(ImageSourceGP):
         return ImageSourceGP
 
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        *unused: Any,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
-        """The images in the walls, refined; no search."""
+        """The images in the walls, refined; no search, so that nothing is looked at or started from."""
         rows = row_sets[0]
-        start = self._scene(rows, settings)
+        given = self._scene(rows, settings)
 
         def near(values: list[Tensor]) -> Tensor:
-            return walls_cost(start.planes, start.sequences, values[1], values[2])
+            return walls_cost(given.planes, given.sequences, values[1], values[2])
 
         def both(values: list[Tensor]) -> Tensor:
-            return near(values) + prior.cost(values[4], start.sequences)
+            return near(values) + prior.cost(values[4], given.sequences)
 
         with late_when(budget.over):
-            scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
+            scene = with_phases(rows, refine(rows, given, STEPS[0], near), QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, STEPS[1], self.kernel)
             prior = ReflectionPhasePrior.of(scene)
             scene = refine(rows, scene, STEPS[2], both)
