@@ -72,7 +72,6 @@ def descend(
     scene: Scene,
     paths: Paths,
     steps: int,
-    soft: float,
     phase_prior: ReflectionPhasePrior,
 ) -> Scene:
     """Return the most likely scene of `steps` steps; paths are those of the start."""
@@ -85,7 +84,7 @@ def descend(
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
-        seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes, soft)
+        seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes)
         waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
