@@ -14,11 +14,11 @@ from gsparc.models.image_sources.clutter import finite_mirrors, search
 from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box
 from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch
-from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
 from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.known.method import ReflectionPhasePrior
 from gsparc.models.image_sources.query import Means
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene

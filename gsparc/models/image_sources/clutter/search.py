@@ -9,14 +9,13 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from torch import Tensor
 
 from gsparc.models.image_sources.backprojection import pick_apart
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
-from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
-from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual, Unexplained
+from gsparc.models.image_sources.clutter.refine import descend
+from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
@@ -29,7 +28,6 @@ log = logging.getLogger(__name__)
 
 BOX, PATCH, MIRROR, SEQUENCE = 6, 4, 5, 1  # parameters of each; a mirror is a patch on a new plane
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
-MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 EPOCHS = 6  # rounds of everything
 STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
@@ -71,7 +69,6 @@ class _ClutterSearcher:
     def _refactor(self, scene: Scene) -> None:
         """Factor the residual's covariance at a scene."""
         self.residual = Residual(self.rows, scene)
-        self.phase_prior = ReflectionPhasePrior.of(scene)
         self._set_scene(self.residual.scene)
 
     def _set_scene(self, scene: Scene) -> None:
@@ -114,7 +111,7 @@ class _ClutterSearcher:
         return False
 
     def _descend(self, steps: int) -> None:
-        scene = descend(self.residual, self.scene, self.paths, steps, self.phase_prior)
+        scene = descend(self.residual, self.scene, self.paths, steps)
         boxes = inside_out(scene.clutter.boxes, self.room)
         self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
@@ -152,8 +149,7 @@ class _ClutterSearcher:
         self._descend(10)
         self._drop()
         self._refactor(self.scene)
-        prior, sequences = self.phase_prior, self.scene.sequences
-        self._refactor(refine(self.rows, self.scene, STEPS, lambda v: prior.cost(v[4], sequences)))
+        self._refactor(refine(self.rows, self.scene, STEPS))
 
     def _mirrors(self) -> None:
         """Try small mirrors, each with its best sequences."""
@@ -172,26 +168,6 @@ class _ClutterSearcher:
         trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
         return self._add(trial, sequences, 1.5, MIRROR, len(sequences))
 
-    def _sequence_scores(
-        self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
-        candidates = scene.over(sequences)
-        paths = candidates.unfolding.paths(self.rows.position)
-        seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
-        waves = candidates.unobstructed(self.rows) * seen.T
-        if self.phase_prior.concentration < MIN_CONCENTRATION:
-            return *scorer.score_waves(waves), candidates.sources
-        turn = self._turns(candidates)
-        scores, gains = scorer.score_positive(waves * turn)
-        return scores, gains * turn, candidates.sources
-
-    def _turns(self, candidates: Scene) -> Tensor:
-        """(W,) complex of size 1, the phases that new sequences are expected to have."""
-        assert self.scene.phase is not None
-        expected = self.phase_prior.expected(self.scene.phase[0], candidates.sequences)
-        return torch.polar(torch.ones(()), expected)
-
     def _add(
         self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, most: int
     ) -> bool:
@@ -199,8 +175,11 @@ class _ClutterSearcher:
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
-        chosen = pick_apart(sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
+        new = scene.over(sequences)
+        paths = new.unfolding.paths(self.rows.position)
+        seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
+        scores, gains = scorer.score_waves(new.unobstructed(self.rows) * seen.T)
+        chosen = pick_apart(new.sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
