@@ -63,10 +63,8 @@ def joint_powers(init: InitSettings, clutter: bool, residual: bool, context: Fit
 
 
 def bearings(init: InitSettings, clutter: bool, residual: bool, context: FitContext) -> ClosedForm:
-    """Return sources where bearings cross, of at most `init.searches` searches."""
-    search = replace(SearchSettings(), sources=init.max_sources)
-    searches = max(round(init.searches * context.effort), 1)
-    return MovingArrayField(search=search, seed=context.seed, searches=searches)
+    """Return sources where bearings cross."""
+    return MovingArrayField(replace(SearchSettings(), sources=init.max_sources), seed=context.seed)
 
 
 def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:

@@ -167,14 +167,6 @@ def crossings() -> Case:
     return Case.fit(MovingArrayField(search, components=64, seed=0), room_of_spectra())
 
 
-def test_one_search_is_not_swept_as_two(crossings, monkeypatch):
-    method, trends = crossings.method, crossings.method.trends
-    assert ("searches" in method.knobs()) == (len(trends) > 1)
-    for count in (1, 2):
-        monkeypatch.setattr(method, "trends", trends[:1] * count)
-        assert ("searches" in method.knobs()) == (count > 1)
-
-
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
     assert crossings.less(confidence=True) is crossings.method
     silent = crossings.less(confidence=False)
