@@ -16,7 +16,7 @@ from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.race import Race
-from gsparc.training.time_budget import Clock, Effort, TimeBudget
+from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudget
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
@@ -132,7 +132,7 @@ class FitContext:
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)
 
-    def time_budget(self) -> TimeBudget:
-        """Return what a fit counts, and the seconds that may end it."""
+    def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
+        """Return what a fit counts, and the seconds that may end it, some spent before."""
         seconds = math.inf if self.budget_s is None else self.budget_s
-        return TimeBudget(seconds, self.budget_clock, effort=Effort().times(self.effort))
+        return TimeBudget(seconds, self.budget_clock, before, Effort().times(self.effort))

@@ -99,6 +99,12 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
 
+def test_without_a_query_there_was_an_error(small):
+    """Its variance was reshaped to a size of -1."""
+    _, data, _, method, _ = small
+    assert _predicted(method, data, np.zeros(0, np.int64)).mean.shape == (0, 1, 1)
+
+
 def test_one_query_is_like_many(small):
     _, data, fold, method, _ = small
     many = _predicted(method, data, fold.test[:5])
