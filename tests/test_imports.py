@@ -36,7 +36,7 @@ ARROWS = {
     "evaluation": "conf data models prediction processes simulate training",
     "apps.maps": "data evaluation models prediction",
     "apps.export": "data field models ops physics prediction processes training",
-    "apps.link": "data evaluation models prediction simulate",
+    "apps.link": "data evaluation models physics prediction simulate",
     "apps.view": "apps.maps data evaluation prediction",
     "callbacks": "data evaluation field training",
     "commands": "apps.export apps.link apps.locate apps.maps apps.view conf "

@@ -25,7 +25,6 @@ VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
-SEARCHES = "searches"  # what `gsparc.models.image_sources.search_cache` calls its own in a last.ckpt
 
 
 class CheckpointError(ValueError):
@@ -159,10 +158,6 @@ def _content(path: Path) -> dict[str, Any]:
         reason = str(error).strip().splitlines()
         why = reason[0] if reason else type(error).__name__
         raise CheckpointError(f"{path}: cannot be read ({why})") from None
-    if isinstance(content, dict) and SEARCHES in content:
-        raise CheckpointError(
-            f"{path}: the finished searches of a run, to go on from with ckpt_path=; the model is {MODEL}"
-        )
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("version")

@@ -138,10 +138,7 @@ def test_a_damaged_directory_is_no_traceback(path):
 
 
 def test_what_is_not_the_model_is_named(tmp_path):
-    """The searches in a last.ckpt were called weights of another program, a folder no checkpoint at all."""
-    torch.save({"key": "k", "spent_s": 1.0, "searches": {}}, tmp_path / "last.ckpt")
-    with pytest.raises(CheckpointError, match=r"ckpt_path=; the model is model\.ckpt"):
-        checkpoint.read(tmp_path / "last.ckpt")
+    """A folder was called no checkpoint at all."""
     np.savez(tmp_path / "data.npz", rx_position=np.zeros(3))
     with pytest.raises(CheckpointError, match="an archive, but not a gsparc checkpoint"):
         checkpoint.read(tmp_path / "data.npz")

@@ -157,7 +157,7 @@ def test_a_method_is_what_the_table_says(name, tmp_path):
     method = method_class(name)().made_for(data_of(name, tmp_path))
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in (*PEERS, "fire", "image_source_gp", "splat", "gsparc", *NAMED))
+    assert method.resumable == (name in (*PEERS, "fire", "splat", "gsparc", *NAMED))
     assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 

@@ -14,9 +14,9 @@ from gsparc.apps.link.adaptation import Band
 from gsparc.data.datasets.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.image_sources.phase_offsets import estimate
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
+from gsparc.physics.row_factors import turning
 from gsparc.prediction.channels import interpolated
 from gsparc.prediction.confidence import judged, rivals
 from gsparc.prediction.risk import Evidence
@@ -113,14 +113,13 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
     site, uplink = data.site, data.uplink
     assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
-    assert site.carrier_hz is not None
     there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
     heard = uplink[rows].astype(np.complex128) * site.target_scale
     # Simulated streets know the channel, but each snapshot was turned by its own phase and timing.
     clean = there.response(site.uplink_hz, rows)
-    coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)
+    coarse = turning(heard, clean, site.uplink_hz, "phase+delay")
     # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
-    rest = (coarse.removed(heard, site.uplink_hz, site.carrier_hz) * clean.conj()).sum(1)
+    rest = (heard * coarse[:, None] * clean.conj()).sum(1)
     away = site.uplink_hz - site.uplink_hz.mean()
     weight = np.abs(rest)
     middle = np.angle(rest.sum(1, keepdims=True))
@@ -131,7 +130,10 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     slope = (weight * (away - mean) * angle).sum(1) / (weight * (away - mean) ** 2).sum(1)
     level = ((weight * angle).sum(1) / weight.sum(1) - slope * mean[:, 0]) + middle[:, 0]
     wanted = there.response(frequency_hz, rows)[:, site.antennas]
-    turn = coarse.phase[:, None] - 2 * np.pi * (frequency_hz - site.carrier_hz) * coarse.delay[:, None]
+    # The phase of a delay is a line over tones, which goes on beyond them as from one to the next.
+    first, second = site.uplink_hz[:2]
+    step = np.angle(coarse[:, 1:2] / coarse[:, :1]) / (second - first)
+    turn = -np.angle(coarse[:, :1]) - step * (frequency_hz - first)
     turn = turn + level[:, None] + slope[:, None] * (frequency_hz - site.uplink_hz.mean())
     turned = wanted * np.exp(1j * turn)[:, None] / site.target_scale
     return torch.from_numpy(turned.astype(np.complex64))

@@ -151,6 +151,10 @@ class DirectionalGP(SourcesInFrame):
             self._refit()
         return changed
 
+    def found(self) -> Found:
+        """Return places [m], local, and amplitudes of the sources, to start a search from."""
+        return self.posterior.positions.points + self._fitted().middle, self.posterior.power.sqrt()
+
     # ---- answers ----
     def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
         """See `SourcesInFrame`."""
@@ -188,19 +192,3 @@ class DirectionalGP(SourcesInFrame):
     def size(self) -> int:
         """Return the number of sources."""
         return len(self.posterior.power) if self.site is not None else 0
-
-
-def where_rays_meet(limit: int, seed: int, data: Measurements, rows: np.ndarray) -> Found:
-    """Return sources of rows (n,), to start a search from: places [m], local, and amplitudes; maybe none.
-
-    Args:
-        limit, seed: of `DirectionalGP`.
-        data: whose directions are measured.
-        rows: that are known.
-    """
-    one = DirectionalGP(limit, seed)
-    try:
-        one.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-    except ValueError:  # the candidate of rays says why
-        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0)
-    return one.posterior.positions.points + one.frame.middle, one.posterior.power.sqrt()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import BETAS, steering
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -91,7 +91,7 @@ def search_box(
     exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(512)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
-    optimizer = torch.optim.Adam([polished], betas=(0.8, 0.95))
+    optimizer = torch.optim.Adam([polished], betas=BETAS)
     for step in range(STEPS):  # each to its own maximum, as the score's logarithms are summed
         raise_if_cancelled()
         optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 
@@ -18,7 +19,6 @@ from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
-from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
 from gsparc.training.time_budget import TimeBudget
 
@@ -29,13 +29,27 @@ SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the er
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
 Look = Callable[[Rows, Scene], None]  # of a search, with phases
-Start = Callable[[int], Found | None]
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
+
+
+@dataclass(frozen=True)
+class Member:
+    """Result of one search.
+
+    Attributes:
+        scene: with phases.
+        left_out: NMSE of its own rows, each receiver predicted from the others.
+        number: of the search, from 0.
+    """
+
+    scene: Scene
+    left_out: float
+    number: int = 0
 
 
 def search_many(
     row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
-    budget: TimeBudget, cache: SearchCache, look: Look | None = None, start: Start | None = None,
+    budget: TimeBudget, look: Look | None = None, start: Found | None = None,
 ) -> list[Member]:  # fmt: skip
     """Run one search per set of rows, best first; at least one, others while the budget lasts.
 
@@ -48,9 +62,8 @@ def search_many(
         settings: of every search.
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: effort of each, and what ends all together.
-        cache: of finished searches.
         look: at the first search after each of its rounds, and after the last.
-        start: sources to start from, of a search by its number.
+        start: sources that each starts from.
 
     Raises:
         Behind: a look says so.
@@ -78,8 +91,7 @@ def search_many(
                 look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
-        found = None if start is None else start(number)
-        search = Search(rows, transmitter, settings, number, last_round, found)
+        search = Search(rows, transmitter, settings, number, last_round, start)
         scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine(rows, learn_visibility(rows, scene, 10, KernelVisibility()), 20)
         if look is not None and number == 0:
@@ -92,9 +104,6 @@ def search_many(
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if member := cache.find(number):
-            errors[number] = member.left_out
-            return member
         if unwanted(number) or (number > 0 and budget.over()):
             return None
         try:
@@ -108,7 +117,6 @@ def search_many(
             number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
         )  # fmt: skip
         errors[number] = member.left_out
-        cache.put(member, budget.limited_by)
         return member
 
     threads = torch.get_num_threads()

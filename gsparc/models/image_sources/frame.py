@@ -117,11 +117,13 @@ class SourcesInFrame(ClosedForm):
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
         # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
-        variance, prior = (each.reshape(count, -1).mean(1) for each in (variance, prior))
+        # Without a query a size of -1 means nothing.
+        each = len(places) // max(count, 1)
+        variance, prior = (part.view(count, each).mean(1) for part in (variance, prior))
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """Return the paths that `predict` sums, one per source: of several searches by the search's weight.
+        """Return the paths that `predict` sums, one per source, which several searches may have found.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
@@ -135,12 +137,31 @@ class SourcesInFrame(ClosedForm):
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
         towards = sources - places[:, :3].reshape(count, -1, 3).mean(1)[:, None]
         unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-        return gain, delay, unit, frame.carrier_hz
+        return *each_once(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
     def _fitted(self) -> Frame:
         if self.site is None or not self.size():
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.frame
+
+
+def each_once(gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first.
+
+    Args:
+        gain: (B, A, N) complex.
+        delay: (B, A, N) [s].
+        unit: (B, N, 3) towards the sources.
+        carrier_hz: of the gains [Hz].
+    """
+    if not len(gain):
+        return gain, delay, unit
+    # A source is where the first query sees it: it stands still.
+    places = unit[:1] * (LIGHT * delay[:1].mean(1))[..., None]
+    first = (torch.cdist(places, places) < LIGHT / carrier_hz / 2).int().argmax(2).flatten()
+    kept, number = first.unique(return_inverse=True)
+    summed = gain.new_zeros(*gain.shape[:2], len(kept)).index_add_(2, number, gain)
+    return summed, delay[..., kept], unit[:, kept]
 
 
 def refuse(site: Site, name: str) -> None:

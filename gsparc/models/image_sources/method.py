@@ -5,40 +5,38 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.assemble import identity
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.field.initial import Snapshot
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path, element_factors
+from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.phase_offsets import Offsets, estimate
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
 from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.models.image_sources.search_cache import Member, SearchCache
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.plain import made, plain
 from gsparc.models.reduced import MeanOnly
 from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.row_factors import Freedom, turning
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import Race
-from gsparc.training.time_budget import TimeBudget, less_repeatable
+from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -52,11 +50,12 @@ class ImageSourceGP(SourcesInFrame):
     """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
-        budget_s: as `FitContext.budget_s`, where that says nothing [s].
         searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see `SearchSettings`.
-        start: places [m], local, and amplitudes of sources that a search of these measurements starts from.
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
+
+    Attributes:
+        start: places [m], local, and amplitudes of sources that each search starts from, or None.
 
     Raises:
         SettingError: a setting that cannot be.
@@ -65,15 +64,14 @@ class ImageSourceGP(SourcesInFrame):
     name = "image_source_gp"
     members: tuple[Posterior, ...] = ()
     _groups: tuple[np.ndarray, ...] = ()
-    resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
+    start: Found | None = None
 
     def __init__(
-        self, searches: int = 6, budget_s: float | None = None, search_rows: int = 700, rows: int = 3000,
-        margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Offsets = "none",
-        clutter: bool = True, seed: int = 0, start: Callable[[Measurements, np.ndarray], Found] | None = None,
+        self, searches: int = 6, search_rows: int = 700, rows: int = 3000,
+        margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Snapshot = "none",
+        clutter: bool = True, seed: int = 0,
     ) -> None:  # fmt: skip
-        self.budget_s, self._start = budget_s, start
         self.settings = SearchSettings(
             searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
         )
@@ -83,25 +81,13 @@ class ImageSourceGP(SourcesInFrame):
 
         Raises:
             ValueError: the data are not channels, or their phase means nothing.
-            KeyboardInterrupt: by the user; the message names the file to go on from.
         """
         refuse(data.site, self.name)
         refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
         self._groups = context.leave_out
-        cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
-        try:
-            return self._fit(data, known, context, cache)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(cache.interrupted()) from None
-
-    def _fit(
-        self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
-    ) -> FitReport:
-        budget_s = self.budget_s if context.budget_s is None else context.budget_s
         effort = context.effort * (1.0 if context.leave_out else ALONE)
-        context = replace(context, budget_s=budget_s, effort=effort)
-        budget, settings = context.time_budget(cache.spent), self.settings
+        budget, settings = replace(context, effort=effort).time_budget(), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
         self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
@@ -126,7 +112,8 @@ class ImageSourceGP(SourcesInFrame):
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = partial(self._looked, context.race, group, data.batch(group), [math.inf])
-        members = self._search(row_sets, settings, budget, cache, look, partial(self._found, data, known))
+        given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
+        members = self._search(row_sets, settings, budget, look, given)
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -137,8 +124,7 @@ class ImageSourceGP(SourcesInFrame):
         self._become(rows, members)
         self.held = self._left_out_rows(data, known, members, len(rows))
         notes += self._described(members, budget)
-        limited = less_repeatable(budget.limited_by, cache.limited_by)
-        return FitReport(budget.counted.wall, tuple(notes), limited)
+        return FitReport(budget.counted.wall, tuple(notes), budget.limited_by)
 
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
@@ -158,12 +144,8 @@ class ImageSourceGP(SourcesInFrame):
         agree = ensemble.at_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
-        inside = int(scene.scatterers(self.members[0].rows).sum())
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
-        notes = [
-            f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources",
-            f"the best search has {len(scene.sequences) - inside} images, {inside} scatterers",
-        ]
+        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources"]
         if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
@@ -182,28 +164,13 @@ class ImageSourceGP(SourcesInFrame):
         self.factors = self.factors * factors
         return replace(data, target=data.target * factors.numpy()[:, None])
 
-    def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
-        """What a search depends on; neither the budget nor the number of searches."""
-        rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
-        # Search number n is the same however many there are: a resumed run may ask for more.
-        settings = replace(self.settings, searches=1, seed=0)
-        seed = str(self.settings.seed)
-        told = f"{settings}, {'alone' if self._start is None else 'from directions'}"
-        return {"data": identity(data), "rows": rows, "seed": seed, "settings": told}
-
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        *more: Any,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
+        """What `search_many` finds about the static end, best first."""
         still, floor = self._transmitter(), self.noise_floor
-        return ensemble.search_many(row_sets, still, settings, floor, budget, cache, *more)
-
-    def _found(self, data: Measurements, known: np.ndarray, number: int) -> Found | None:
-        """What a search by its number starts from, in the frame."""
-        if self._start is None or data.directions is None:
-            return None
-        places, amplitude = self._start(data, self._kept(known, number))
-        return places - self.frame.middle, amplitude
+        return ensemble.search_many(row_sets, still, settings, floor, budget, look, start)
 
     def _looked(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
@@ -260,7 +227,7 @@ class ImageSourceGP(SourcesInFrame):
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20, clutter=False)
             rows = self._searched_rows(aligned, known, 0)
-            scene = self._search([rows], few, budget, SearchCache())[0].scene
+            scene = self._search([rows], few, budget)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
                 gains = Posterior(self._searched_rows(aligned, known, 0), scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)
@@ -270,7 +237,7 @@ class ImageSourceGP(SourcesInFrame):
         self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
-        frequency, carrier = data.site.tones(), self.frame.carrier_hz
+        frequency = data.site.tones()
         places = measured_places(data, known).clone()
         places[..., :3] -= self.frame.middle
         turned = orientations(scene.planes, scene.sequences)
@@ -281,10 +248,10 @@ class ImageSourceGP(SourcesInFrame):
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
         predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
-        mask, timing = None if data.mask is None else data.mask[known], self.settings.offsets != "phase"
-        offsets = estimate(data.target[known], predicted, frequency, carrier, timing, mask)
+        measured = data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
+        free: Freedom = "phase" if self.settings.offsets == "phase" else "phase+delay"
         target = data.target.copy()
-        target[known] = offsets.removed(data.target[known], frequency, carrier)
+        target[known] *= turning(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
     def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -311,29 +278,16 @@ class ImageSourceGP(SourcesInFrame):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Method.knobs`."""
-        return ("searches", "keep", "confidence")
-
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return `contribution0`, `contribution1`, ... (K,): mean power of each search's sources at rows."""
-        return {
-            f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
-            for i, member in enumerate(self.members)
-        }
+        return ("searches", "confidence")
 
     @torch.no_grad()
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduced`: `searches` of largest weight, a share of their sources (`keep`), no variance.
-
-        The gains of the remaining sources are fitted anew: one factorisation here, nothing at queries.
-        """
+        """See `Method.reduced`: `searches` of largest weight, no variance; no source can be spared."""
         twin = copy.copy(self)
         count = min(int(settings.get("searches", len(self.members))), len(self.members))
         chosen = self.weights.topk(count).indices.sort().values
         twin.weights = self.weights[chosen] / self.weights[chosen].sum()
-        kept, share = {i: self.members[i] for i in chosen.tolist()}, settings.get("keep")
-        if share is not None:
-            kept = {i: _loudest(one, float(share), measured[f"contribution{i}"]) for i, one in kept.items()}
-        twin.members = tuple(kept.values())
+        twin.members = tuple(self.members[i] for i in chosen.tolist())
         whole = settings.get("confidence", True)
         twin.query = Means(twin.members, VARIANCE_ROWS if whole else 0)
         return twin if whole else MeanOnly(twin)
@@ -378,10 +332,3 @@ class ImageSourceGP(SourcesInFrame):
     def size(self) -> int:
         """Return the number of sources of the largest scene."""
         return max((len(member.scene.sequences) for member in self.members), default=0)
-
-
-def _loudest(member: Posterior, share: float, contribution: Tensor) -> Posterior:
-    """A search with the sources that contribute (K,) most, and the transmitter, where all sequences start."""
-    count = max(1, math.ceil(share * len(contribution)))
-    loudest = sorted({0, *contribution.topk(count).indices.tolist()})
-    return Posterior(member.rows, member.scene.only(loudest))

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import accumulate
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import Obstacles
-from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
-from gsparc.models.image_sources.scene import Scene, directions
+from gsparc.models.image_sources.scene import directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
@@ -40,11 +37,8 @@ class Means:
         towards: (K, 3, n) float32, unit vectors from source to place times `-6 / angle^2`.
         level: (K, 1, 2 R), what does not vary of the gains, real and imaginary.
         weights: (K, n, 2 R), of what varies.
-        unfolding, obstacles: paths of the K sources and what occludes them; None without clutter.
+        hiding: paths of each scene's sources and what occludes them; none where no scene has clutter.
     """
-
-    unfolding: Unfolding | None = None
-    obstacles: Obstacles | None = None
 
     def __init__(self, members: Sequence[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
@@ -59,8 +53,9 @@ class Means:
         constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
         toward = directions(self.places[:, :3], self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
-        if any(len(scene.clutter) for scene in scenes):
-            self.unfolding, self.obstacles = _together(scenes, self.counts)
+        # Not at the first query, which may be for inference alone.
+        hides = any(len(scene.clutter) for scene in scenes)
+        self.hiding = [(scene.unfolding, scene.obstacles) for scene in scenes] if hides else []
         dual = torch.cat([member.dual_weights for member in members])
         dual = dual * torch.cat([scene.turns for scene in scenes])[:, None, None]
         weight = torch.zeros(len(dual), len(self.places), rows.target.shape[1], dtype=dual.dtype)
@@ -71,9 +66,10 @@ class Means:
 
     def visible_share(self, queries: Tensor) -> Tensor | None:
         """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
-        if self.unfolding is None or self.obstacles is None:
+        if not self.hiding:
             return None
-        return self.obstacles.visible_share(self.unfolding.paths(queries[:, :3]))
+        places = queries[:, :3]
+        return torch.cat([hidden.visible_share(legs.paths(places)) for legs, hidden in self.hiding])
 
     def ranges(self, queries: Tensor) -> Tensor:
         """Return ranges (m, K) float64 [m] of sources, or of their images of antennas of queries (m, 6)."""
@@ -166,18 +162,5 @@ class RowVariance:
         product = torch.bmm(here.mT, there.flatten(2).transpose(0, 1)).unflatten(2, (2, -1))
         cross = torch.addcmul(self.along * product, product.flip(1, 2), self.across)
         prior = here.square().sum(2) @ self.power + self.noise
-        known = (cross.view(2 * len(here), -1) @ self.root).square().sum(1)
+        known = (cross.flatten(2).flatten(0, 1) @ self.root).square().sum(1)
         return (prior - known.view(-1, 2).sum(1)).clamp_min(0), prior
-
-
-def _together(scenes: list[Scene], counts: list[int]) -> tuple[Unfolding, Obstacles]:
-    """Paths of all sources of the scenes, in order, and what occludes each of its own scene."""
-    planes = [scene.planes for scene in scenes]
-    transmitters = [scene.transmitter.expand(n, 3) for scene, n in zip(scenes, counts, strict=True)]
-    sequences = [
-        tuple(first + plane for plane in sequence)
-        for scene, first in zip(scenes, [0, *accumulate(map(len, planes))], strict=False)
-        for sequence in scene.sequences
-    ]
-    unfolding = Unfolding(torch.cat(transmitters), torch.cat(planes), tuple(sequences))
-    return unfolding, Obstacles([scene.clutter for scene in scenes], planes, counts)

@@ -11,13 +11,12 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, correlations, steering
+from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene, correlations, steering
 from gsparc.physics.mirror_planes import images
 from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
-BETA1, BETA2 = 0.8, 0.95  # decay rates of Adam's moments, for tens of steps
 DECAY_AFTER, DECAY = 0.6, 0.3  # smaller steps for the last 40 %
 TRANSMITTER_STEP = 0.0004  # [m]; small, its position is measured
 PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and along it [m]
@@ -60,10 +59,10 @@ def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Sc
         decay = 1.0 if step < DECAY_AFTER * steps else DECAY
         moved = []
         for i, g in enumerate(gradient):
-            first[i] = BETA1 * first[i] + (1 - BETA1) * g
-            second[i] = BETA2 * second[i] + (1 - BETA2) * g * g
-            mean = first[i] / (1 - BETA1 ** (step + 1))
-            size = (second[i] / (1 - BETA2 ** (step + 1))).sqrt() + 1e-9
+            first[i] = BETAS[0] * first[i] + (1 - BETAS[0]) * g
+            second[i] = BETAS[1] * second[i] + (1 - BETAS[1]) * g * g
+            mean = first[i] / (1 - BETAS[0] ** (step + 1))
+            size = (second[i] / (1 - BETAS[1] ** (step + 1))).sqrt() + 1e-9
             moved.append(values[i] - decay * rates[i] * mean / size)
         values = moved
     transmitter, planes, log_amplitude, log_noise, *phase = best
@@ -112,7 +111,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
     shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
     about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
     width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * wide
-    optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=(0.8, 0.95))
+    optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=BETAS)
 
     def current() -> Scene:
         trial = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())

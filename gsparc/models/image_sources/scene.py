@@ -11,15 +11,15 @@ from typing import final
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
+from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows, box_of
+from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
 
+BETAS = 0.8, 0.95  # decay rates of Adam's moments: of tens of steps, not its usual thousand
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
-BEHIND_M = 0.05  # by which the box of places is smaller, so that images just behind a wall stay images
 ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared distance
 
 
@@ -112,6 +112,11 @@ class Scene:
         """The legs of every sequence's path."""
         return Unfolding(self.transmitter, self.planes, self.sequences)
 
+    @cached_property
+    def obstacles(self) -> Obstacles:
+        """What hides paths."""
+        return Obstacles(self.clutter, self.planes)
+
     @property
     def walls(self) -> list[int]:
         """Numbers of planes that make a source of one reflection."""
@@ -127,18 +132,7 @@ class Scene:
         """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3) [m]."""
         if not len(self.clutter):
             return torch.ones(1, 1)
-        return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
-
-    def scatterers(self, rows: Rows) -> Tensor:
-        """Return which sources (K,) bool are scatterers; others are images.
-
-        A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands
-        inside the box of receivers and transmitter, the transmitter itself apart, is a scatterer.
-        """
-        points, box = self.sources, box_of(rows, self.transmitter)
-        inside = ((points > box[0] + BEHIND_M) & (points < box[1] - BEHIND_M)).all(1)
-        # Within 10 cm it is the transmitter itself.
-        return inside & (torch.linalg.vector_norm(points - points[0], dim=1) > 0.1)
+        return self.obstacles.visible_share(self.unfolding.paths(places)).T
 
     def images(self, rows: Rows) -> Tensor:
         """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
+from gsparc.field.initial import Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.phase_offsets import Offsets
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows, box_of
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
@@ -60,7 +60,7 @@ class SearchSettings(Checked):
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
     order: int = setting(3, whole(0))
-    offsets: Offsets = setting("none", choice(*get_args(Offsets)))
+    offsets: Snapshot = setting("none", choice(*get_args(Snapshot)))
     clutter: bool = setting(True, switch())
     seed: int = 0
     final_steps: int = 80

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from gsparc.data.walls import read_walls
@@ -13,7 +12,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.directional.method import DirectionalGP, where_rays_meet
+from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.moving_array.method import MovingArrayField
@@ -29,10 +28,12 @@ Candidate = Callable[[InitSettings, bool, FitContext], ClosedForm]
 def sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return image sources of several searches.
 
-    Searches start where measured directions meet, but for `init=sources`, which is without them.
+    Searches start where measured directions meet, where these were solved before.
     """
-    start = None if init.name == "sources" else partial(where_rays_meet, init.rows, context.seed)
-    return ImageSourceGP(**_searched(init, clutter, context), start=start)
+    method = ImageSourceGP(**_searched(init, clutter, context))
+    if "rays" in context.beside:
+        method.start = context.beside["rays"].found()
+    return method
 
 
 def scene(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
@@ -60,10 +61,8 @@ def joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> Clos
 
 
 def bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Return sources where bearings cross, of at most `init.searches` searches."""
-    search = replace(SearchSettings(), sources=init.max_sources)
-    searches = max(round(init.searches * context.effort), 1)
-    return MovingArrayField(search=search, seed=context.seed, searches=searches)
+    """Return sources where bearings cross."""
+    return MovingArrayField(replace(SearchSettings(), sources=init.max_sources), seed=context.seed)
 
 
 def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:

@@ -71,18 +71,15 @@ def fit_all(
         context.curve(budget.counted.wall, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES:
-            # A resumed run reads finished searches back, however few seconds are left.
-            spent = fields and context.resume is None and budget.over()
-            if why := "the seconds were over" if spent else _reached(race):
-                log.info("init=%s is left out: %s", name, why)
-                continue
+        if name in SEARCHES and (why := _needless(race, bool(fields) and budget.over())):
+            log.info("init=%s is left out: %s", name, why)
+            continue
         within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
         try:
             leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
-            within = replace(within, leave_out=leave_out, race=race)
+            within = replace(within, leave_out=leave_out, race=race, beside=fields)
             with heeded.apart() as read[name], late_when(budget.over):
                 clutter = name not in CLUTTERED or effects.visibility is not False
                 field = parts[name](settings, clutter, within)
@@ -108,8 +105,10 @@ def fit_all(
     return fields, reports, read
 
 
-def _reached(race: Race | None) -> str | None:
-    """Why no search can gain much, where another solution is as near as searches come; else None."""
+def _needless(race: Race | None, over: bool) -> str | None:
+    """Why no search is begun: the time is over, or another solution as near as searches come; else None."""
+    if over:
+        return "the seconds were over"
     if race is None or race.error > CONVERGED_ERROR:
         return None
     return f"another solution has an NMSE of {race.error:.4f} on held-out rows"

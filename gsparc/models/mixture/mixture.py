@@ -26,6 +26,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import factors_of_runs
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.each_or_together import LearnsTogether
+from gsparc.models.image_sources.frame import each_once
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
@@ -254,7 +255,7 @@ class Mixture(LearnsTogether, ClosedForm):
         return self.only.process() if isinstance(self.only, HasProcess) else None
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
-        """See `HasPaths`; those of every solution that is made of paths, by its weight in the mean.
+        """See `HasPaths`; of solutions that are made of paths each source once, by their weights in the mean.
 
         What other solutions and the residual add to channels is in no path.
         """
@@ -264,7 +265,8 @@ class Mixture(LearnsTogether, ClosedForm):
         result = [(weight, method.paths(query)) for weight, method in made]
         gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
         delay = torch.cat([one[1] for _, one in result], dim=2)
-        return gain, delay, torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
+        unit, carrier = torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
+        return *each_once(gain, delay, unit, carrier), carrier
 
     # -- what it is made of --------------------------------------------------------------------------
 

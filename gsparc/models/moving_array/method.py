@@ -1,12 +1,11 @@
 """`model=moving_array`: sources, their powers as smooth trends, a Gaussian process on residual spectra.
 
 The trend moves directions of arrival with the receiver, which interpolating images cannot; the residual
-goes to a Gaussian process on images. Images of several searches are averaged.
+goes to a Gaussian process on images.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -40,10 +39,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
-log = logging.getLogger(__name__)
-
 UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
-MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
 
 
 @dataclass(frozen=True)
@@ -73,36 +69,30 @@ class Spectra:
 class MovingArrayField(Differentiable, ClosedForm):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
-    It searches until the leave-one-out error stops falling, the searches are done or the seconds are over.
-
     Args:
         search: how sources are found.
         trend: how smooth their powers are.
-        searches: number.
         rest_rows: that the residual's kernel is chosen on; seconds grow with their cube.
         components: largest number of principal components of the residual; 0: the trends alone.
-        seed: of the first search; the others have the next ones.
+        seed: of the search.
         name: as it appears in tables.
     """
 
     effects = "moving_array"
-    stored = ("trends", "exponent", "residual", "positions", "errors")
+    stored = ("found", "exponent", "residual", "positions", "errors")
     takes_budget = True
+    found: PowerTrend  # sources and their powers
 
     def __init__(
         self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
-        searches: int = 1, rest_rows: int = 1500, components: int = 512, seed: int = 0,
-        name: str = "moving_array",
+        rest_rows: int = 1500, components: int = 512, seed: int = 0, name: str = "moving_array",
     ) -> None:  # fmt: skip
         super().__init__()
-        if searches < 1 or rest_rows < 3:
-            raise ValueError(
-                f"{name}: model.searches={searches}, model.rest_rows={rest_rows}: expected at least 1 and 3"
-            )
+        if rest_rows < 3:
+            raise ValueError(f"{name}: model.rest_rows={rest_rows}: expected at least 3")
         self.search, self.trend = search, trend
-        self.searches, self.rest_rows, self.components = searches, rest_rows, components
+        self.rest_rows, self.components = rest_rows, components
         self.seed, self.name = seed, name
-        self.trends: list[PowerTrend] = []
         self.rows = np.zeros(0, np.int64)  # that it was conditioned on; none where it was restored
         self._budget = TimeBudget()
 
@@ -127,44 +117,25 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Method.reduced`; searches where there are several."""
-        own = ("keep", "stride", "confidence")
-        return ("searches", *own) if len(self.trends) > 1 else own
+        """See `Method.reduced`."""
+        return ("keep", "stride", "confidence")
 
     reduced = reduced
 
     # -- learning ----------------------------------------------------------------------------------
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        budget, watch = self._budget, TimeBudget()
         # Before any lags are taken: they are linear in power, not in amplitude.
         self.exponent = self._exponent(targets)
         self.basis = separable(self._blocks(targets), UNRESOLVED)
         spectra = self._spectra(positions, targets)
-        self.trends, errors = [], []
-        modelled = torch.zeros_like(spectra.values)  # sum over searches of left-out images
-        while True:
-            sources = self._find(spectra)
-            power = self._powers(spectra, sources)
-            modelled += self._add(spectra, sources, power, self._choose_kernel(spectra, sources, power))
-            rows = _spread(len(positions), self.trend.rows)
-            # What the mean of the searches so far would miss, were this the last.
-            left = spectra.values[rows] - modelled[rows] / len(self.trends)
-            errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
-            log.info(
-                "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
-                self.name, len(errors), len(sources), self.trends[-1].kernel.length, errors[-1], watch.spent,
-            )  # fmt: skip
-            settled = len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
-            if settled or len(errors) == self.searches or budget.over():
-                break
-        modelled /= len(self.trends)
+        sources = self._find(spectra)
+        power = self._powers(spectra, sources)
+        modelled = self._smooth(spectra, sources, power, self._choose_kernel(spectra, sources, power))
         rows = _spread(len(positions), self.rest_rows)
-        # After the last search: the residual is of the mean of all, not of any one.
-        kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])[1]
+        left, kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])
         self._complete(spectra, modelled, kernel, targets)
-        note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, leave-one-out error "
-        note += " ".join(f"{error:.4g}" for error in errors)
+        note = f"{self.name}: {self.size()} sources, leave-one-out error {left / targets[0].size:.4g}"
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
@@ -175,12 +146,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
-        # Trends are emptied, as `_add` appends those of the new rows.
-        spectra, before, self.trends = self._spectra(data.moving[rows], targets), self.trends, []
-        modelled = torch.zeros_like(spectra.values)
-        for one in before:
-            modelled += self._add(spectra, one.sources, self._powers(spectra, one.sources), one.kernel)
-        self._complete(spectra, modelled / len(self.trends), self.residual.kernel, targets)
+        spectra, one = self._spectra(data.moving[rows], targets), self.found
+        modelled = self._smooth(spectra, one.sources, self._powers(spectra, one.sources), one.kernel)
+        self._complete(spectra, modelled, self.residual.kernel, targets)
 
     def _exponent(self, targets: np.ndarray) -> int:
         """Whether pixels are amplitude (2) or power (1).
@@ -202,13 +170,13 @@ class MovingArrayField(Differentiable, ClosedForm):
         return Spectra(places, lags, values)
 
     def _find(self, spectra: Spectra) -> Tensor:
-        """Sources (K, 3) [m] of the next search."""
+        """Sources (K, 3) [m]."""
         assert self.site is not None and self.site.grid is not None
         some, static = spectra.at(_spread(len(spectra.places), self.search.rows)), self.site.static_position
         first = None if static is None else torch.from_numpy(np.asarray(static)).float()
         return find_sources(
             some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
-            self.seed + len(self.trends), self._budget.over,
+            self.seed, self._budget.over,
         )  # fmt: skip
 
     def _powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
@@ -219,10 +187,9 @@ class MovingArrayField(Differentiable, ClosedForm):
             for part, places in zip(spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True)
         ]).double().numpy()  # fmt: skip
 
-    def _add(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
-        """Append the trend of powers (n, K); its left-out images (n, R)."""
-        trend, left = fit_trend(sources, kernel, spectra.places, power)
-        self.trends.append(trend)
+    def _smooth(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+        """Fit the trend of powers (n, K); its left-out images (n, R)."""
+        self.found, left = fit_trend(sources, kernel, spectra.places, power)
         return self._modelled(spectra, sources, torch.from_numpy(left).float())
 
     def _modelled(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
@@ -263,10 +230,10 @@ class MovingArrayField(Differentiable, ClosedForm):
             features.append(image_features(images, energy[part]))
         # two images drawn at random differ by twice the variance
         prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
+        reach = self.found.kernel.length
         self.errors = fit_errors(
-            spectra.places, torch.cat(relative), torch.cat(features), kernel,
-            float(np.mean([trend.kernel.length for trend in self.trends])), prior,
-        )  # fmt: skip
+            spectra.places, torch.cat(relative), torch.cat(features), kernel, reach, prior
+        )
         self._left_error = torch.cat(errors)
 
     def left_out(self) -> LeftOutRows:
@@ -295,12 +262,12 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
-            self._query = Images(self.array(), self.basis, self.trends, self.residual, places)
+            self._query = Images(self.array(), self.basis, self.found, self.residual, places)
         return self._query
 
     def size(self) -> int:
-        """Return the number of sources of all searches."""
-        return sum(len(trend.sources) for trend in self.trends)
+        """Return the number of sources."""
+        return len(self.found.sources) if "found" in vars(self) else 0
 
     def array(self, stride: int = 1) -> Array:
         """Return the array, which looks at every `stride`-th pixel."""
@@ -330,7 +297,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)
         self._lags = self._query = None
-        self.trends, self.basis = list(self.trends), Separable(**state["basis"])
+        self.basis = Separable(**state["basis"])
 
     def _learned(self) -> dict[str, Any]:
         return {**super()._learned(), "basis": vars(self.basis)}

@@ -1,13 +1,12 @@
 """Images at new places: sources rendered through the array, and what they leave.
 
-Reduced, fewer searches, residual components and pixels, without the variance. The number of sources is not
+Reduced, fewer residual components and pixels, without the variance. The number of sources is not
 reduced: a quarter of 48 saves 0.02 ms.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -80,16 +79,16 @@ class Images:
     Args:
         array: that looks.
         basis: of what the residual adds, on the array's pixels.
-        trends: of the searches, whose images are averaged.
+        trend: of the sources' powers.
         residual: the process.
         places: (n, 3) float64 [m] of the training receivers.
     """
 
     def __init__(
-        self, array: Array, basis: Separable, trends: Sequence[PowerTrend], residual: Residual,
+        self, array: Array, basis: Separable, trend: PowerTrend, residual: Residual,
         places: Tensor,
     ) -> None:  # fmt: skip
-        self._array, self._basis, self._trends, self._residual = array, basis, trends, residual
+        self._array, self._basis, self._trend, self._residual = array, basis, trend, residual
         # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
@@ -98,8 +97,7 @@ class Images:
         """At places (m, 3) float64 [m]."""
         receivers, centred = (at.to(self._places.dtype) for at in (where, where - self._middle))
         far = apart(centred, self._places)
-        images = [self._array.render(t.sources, receivers, t.powers(far)) for t in self._trends]
-        explained = images[0] if len(images) == 1 else torch.stack(images).mean(0)
+        explained = self._array.render(self._trend.sources, receivers, self._trend.powers(far))
         added = self._residual.coefficients(far)
         # In place into fresh images: another copy would be as large as the answer.
         return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
@@ -111,7 +109,7 @@ class Images:
 
 
 def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """Return the mean of the first `searches` with the strongest components of the residual (`keep`).
+    """Return the mean with the strongest components of the residual (`keep`).
 
     On fewer pixels (`stride`) and without its variance.
 
@@ -125,8 +123,7 @@ def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Te
     if grid.width % stride:
         raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
     count = math.ceil(float(settings.get("keep", 1.0)) * len(method.residual.axes))
-    searches = max(int(settings.get("searches", len(method.trends))), 1)
-    lean = ReducedMean(method, searches, count, stride)
+    lean = ReducedMean(method, count, stride)
     return Filled(lean, grid, stride) if stride > 1 else lean
 
 
@@ -135,17 +132,16 @@ class ReducedMean(View):
 
     Args:
         inner: fitted.
-        searches: the first so many are evaluated.
         count: of the residual's components.
         stride: of the pixels.
     """
 
-    def __init__(self, inner: MovingArrayField, searches: int, count: int, stride: int) -> None:
+    def __init__(self, inner: MovingArrayField, count: int, stride: int) -> None:
         super().__init__(inner)
         basis = inner.basis if stride == 1 else inner.basis.thinned(stride)
-        trends, residual = inner.trends[:searches], inner.residual.first(count)
+        residual = inner.residual.first(count)
         places = torch.from_numpy(inner.positions)
-        self._query = Images(inner.array(stride), basis, trends, residual, places)
+        self._query = Images(inner.array(stride), basis, inner.found, residual, places)
         self._count = count
 
     @torch.no_grad()

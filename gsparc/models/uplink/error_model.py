@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.models.uplink.interface import power
 from gsparc.models.uplink.search import Sources
 from gsparc.physics.plane_waves import Aperture
 
@@ -39,8 +40,7 @@ class SearchResult:
         and delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
         """
         sources = self.sources
-        power = self.uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
-        strength = sources.gain.abs().square()
+        heard, strength = power(self.uplink), sources.gain.abs().square()
         total = strength.sum(1).clamp_min(1e-30)
         turns = 2 * math.pi * aperture.tones.abs().max()
         # An unknown phase costs no more than the source's power, which a first order does not know.
@@ -49,16 +49,16 @@ class SearchResult:
         share = strength / total[:, None]
         middle = (share * sources.delay).sum(1, keepdim=True)
         columns = [
-            self.noise / power,
-            self.residual.abs().square().mean((1, 2)) / self.noise.clamp_min(1e-30),
-            sources.error_variance(aperture) / power,
-            (delay_error + gain_variance) / power,
-            total / power,
+            self.noise / heard,
+            power(self.residual) / self.noise.clamp_min(1e-30),
+            sources.error_variance(aperture) / heard,
+            (delay_error + gain_variance) / heard,
+            total / heard,
             1 / share.square().sum(1),
             (share * (sources.delay - middle) ** 2).sum(1).sqrt(),
-            gain_variance / power,
-            mean.abs().square().mean((1, 2)) / power,
-            torch.full_like(power, mean[0].numel()),
+            gain_variance / heard,
+            power(mean) / heard,
+            torch.full_like(heard, mean[0].numel()),
         ]
         return torch.stack([column.clamp_min(1e-9).log10() for column in columns], 1)
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import internal
+from gsparc.models.uplink.interface import power
 from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 from gsparc.processes.factor import Factor
 
@@ -113,9 +114,9 @@ class SourceSearch:
     def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
         """Sources of snapshots (B, A, K) complex64 of noise power (B,), and the residual (B, A, K)."""
         s = self.settings
-        power = snapshot.abs().square().mean((1, 2))
-        scale = power.sqrt().clamp_min(1e-30)
-        y, noise = snapshot / scale[:, None, None], noise / power.clamp_min(1e-30) + s.leakage
+        heard = power(snapshot)
+        scale = heard.sqrt()
+        y, noise = snapshot / scale[:, None, None], noise / heard + s.leakage
         count = len(snapshot)
         direction, delay = snapshot.real.new_zeros(count, 0, 2), snapshot.real.new_zeros(count, 0)
         prior, residual = delay, y

@@ -14,12 +14,14 @@ from scenes import error
 from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import with_direction_errors
-from gsparc.models.directional.method import DirectionalGP, where_rays_meet
+from gsparc.field.initial import InitSettings
+from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import gather
 from gsparc.models.image_sources.scene import steering
 from gsparc.models.image_sources.search import Search, SearchSettings
+from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
 
@@ -52,13 +54,18 @@ def test_few_receivers_are_enough_with_directions():
 def test_a_search_starts_from_sources_where_rays_meet():
     data, _, sources = directed(60)
     rows = np.arange(60)
-    found, still = where_rays_meet(3000, 0, data, rows), torch.from_numpy(data.site.static_position).double()
+    fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
+    found = fitted(data, fold)[0].found()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
         start = Search(gather(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
         assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
-    blind = replace(data, directions=[one[:0] for one in data.directions])
-    assert len(where_rays_meet(3000, 0, blind, rows)[0]) == 0
+    context, init = FitContext(beside={"rays": fitted(data, fold)[0]}), InitSettings()
+    given = CANDIDATES["sources"](init, True, False, context).start
+    assert (
+        torch.equal(given[0], found[0])
+        and CANDIDATES["sources"](init, True, False, FitContext()).start is None
+    )
 
 
 def test_occlusion_by_a_pillar_is_learned(pillar):
@@ -223,6 +230,6 @@ def test_the_conference_room_from_43_receivers():
     method, _ = fitted(data, fold)
     assert len(fold.train) + len(fold.val) == 43
     assert error(method, data, fold.test) < 0.08
-    searched = ImageSourceGP(searches=1, budget_s=5, clutter=False)
-    searched.fit(data, fold, FitContext())
+    searched = ImageSourceGP(searches=1, clutter=False)
+    searched.fit(data, fold, FitContext(budget_s=5))
     assert error(searched, data, fold.test) > 0.5

@@ -48,9 +48,10 @@ def missed(field, data, rows):
 def test_sources_are_found_within_the_settings(data, found):
     field, report = found
     assert field.count == 9 and field.terms == ("moving_array", "residual") and report.seconds > 0
-    (trend,) = field.trends
-    np.testing.assert_array_equal(trend.sources[0], np.float32(data.site.static_position))  # it stays there
-    assert "1 searches" in report.notes[0]
+    np.testing.assert_array_equal(
+        field.found.sources[0], np.float32(data.site.static_position)
+    )  # it stays there
+    assert "9 sources" in report.notes[0]
     assert site_problem(data) is None
     bare = dataclasses.replace(data, site=dataclasses.replace(data.site, array=None))
     assert "no array" in str(site_problem(bare))
@@ -84,14 +85,13 @@ def test_nothing_is_known_a_hundred_metres_away(data, field):
 
 
 def test_more_rows_condition_it_better(data, field):
-    places = [trend.sources.clone() for trend in field.trends]
+    places = field.found.sources.clone()
     test = np.arange(1, 160, 4)
     before = missed(field, data, test)
     field.condition(data, np.concatenate([ROWS, np.arange(3, 160, 4)]))
     assert missed(field, data, test) < before
     assert len(field.left_out().rows) == 120
-    for old, trend in zip(places, field.trends, strict=True):
-        assert torch.equal(old, trend.sources)
+    assert torch.equal(places, field.found.sources)
     field.condition(data, ROWS)
     assert missed(field, data, test) == pytest.approx(before, rel=1e-3)
 

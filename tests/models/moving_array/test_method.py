@@ -91,23 +91,11 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
 
 
-def test_several_searches_are_averaged(data, fold, split, tmp_path):
-    once, twice = (MovingArrayField(search=QUICK, components=64, searches=count) for count in (1, 2))
-    notes = [method.fit(data, fold, FitContext(tmp_path)).notes[0] for method in (once, twice)]
-    assert "2 searches" in notes[1] and twice.size() > once.size() and len(twice.trends) == 2
-    assert not torch.equal(twice.trends[0].sources, twice.trends[1].sources)
-    torch.testing.assert_close(twice.trends[0].sources, once.trends[0].sources)
-    one, two = (score((m,), data, split, "test").figures()["psnr_db"] for m in (once, twice))
-    assert two > one - 0.3
-
-
-def test_searches_end_when_they_no_longer_help_or_the_seconds_are_over(data, fold, tmp_path):
-    method = MovingArrayField(search=QUICK, components=16, searches=9)
+def test_a_search_ends_when_the_seconds_are_over(data, fold, tmp_path):
+    """The clock that ended it was not reported."""
+    method = MovingArrayField(search=QUICK, components=16)
     report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3, budget_clock="processor"))
-    assert len(method.trends) == 1 and report.limited_by == "processor"  # which was not reported
-    report = method.fit(data, fold, FitContext(tmp_path))
-    assert 1 < len(method.trends) < 9 and report.limited_by is None
-    assert not method.resumable
+    assert report.limited_by == "processor" and not method.resumable
 
 
 def test_powers_are_the_best_that_are_not_negative():

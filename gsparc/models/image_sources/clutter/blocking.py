@@ -8,7 +8,6 @@ can be moved by gradients.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -66,38 +65,27 @@ class Clutter:
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
     """Return the visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
-    return Obstacles([clutter], [planes], [len(paths.valid)]).visible_share(paths, soft)
+    return Obstacles(clutter, planes).visible_share(paths, soft)
 
 
 class Obstacles:
-    """Clutter of one or more scenes, prepared for paths of all their K sources.
-
-    Args:
-        clutters, planes, sources: of each scene its clutter, planes (P, 4) and number of sources.
+    """Clutter of a scene, prepared for paths.
 
     Attributes:
         boxes: (B, 6).
-        box_mask: (B, K, 1) bool, sources that a box applies to.
         patches: (Q, 4).
-        patch_mask: (Q, K, 1) bool, sources that a patch applies to.
         plane: (Q, 1, 1, 1) planes of the patches.
         axes: (3, Q, 3), normals and both tangents of these planes.
         offset: (Q, 1, 1, 1) of these planes.
         ends: (P + 1,) bool, which planes have patches; the last is no plane.
     """
 
-    def __init__(self, clutters: list[Clutter], planes: list[Tensor], sources: list[int]) -> None:
-        first, table = [0, *accumulate(map(len, planes))], torch.cat(planes)
-        numbers = [i + start for each, start in zip(clutters, first, strict=False) for i in each.plane]
-        plane = torch.tensor(numbers, dtype=torch.long)
-        self.ends = torch.zeros(len(table) + 1, dtype=torch.bool)
+    def __init__(self, clutter: Clutter, planes: Tensor) -> None:
+        plane = torch.tensor(clutter.plane, dtype=torch.long)
+        self.ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
         self.ends[plane] = True
-        used, owner = table[plane], _scene_of(sources)
+        used, self.boxes, self.patches = planes[plane], clutter.boxes, clutter.patches
         axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
-        self.boxes = torch.cat([each.boxes for each in clutters])
-        self.box_mask = (_scene_of([len(each.boxes) for each in clutters])[:, None] == owner)[..., None]
-        self.patches = torch.cat([each.patches for each in clutters])
-        self.patch_mask = (_scene_of([len(each.plane) for each in clutters])[:, None] == owner)[..., None]
         self.plane, self.offset = plane.view(-1, 1, 1, 1), used[:, 3].float().view(-1, 1, 1, 1)
         self.axes = torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3)
 
@@ -105,14 +93,12 @@ class Obstacles:
         """Return the visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
-            passed = torch.where(self.box_mask, past_boxes(paths, self.boxes, soft), 1.0)
-            seen = seen * passed.prod(0)
+            seen = seen * past_boxes(paths, self.boxes, soft).prod(0)
         if len(self.patches):
             seen = seen * self._past_patches(paths, soft)
         return seen
 
     def _past_patches(self, paths: Paths, soft: float) -> Tensor:
-        mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
         turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
         height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
         height = height - self.offset
@@ -121,7 +107,7 @@ class Obstacles:
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
-        outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
+        outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & paths.valid[..., None])
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.plane]
@@ -158,11 +144,6 @@ def _inside(place: list[Tensor], patches: Tensor, soft: float) -> Tensor:
     low_u, low_v, high_u, high_v = patches.T.reshape(4, -1, *[1] * (u.dim() - 1))
     inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
     return torch.sigmoid(inner / soft)
-
-
-def _scene_of(counts: list[int]) -> Tensor:
-    """The number of the scene that each of so many pieces of every scene belongs to."""
-    return torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
 
 
 def tangents(plane: Tensor) -> Tensor:

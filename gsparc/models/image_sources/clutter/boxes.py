@@ -14,7 +14,7 @@ from gsparc.models.image_sources.clutter.residual import Unexplained
 THINNEST = 0.03  # [m]
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
 TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
-CHILDREN = 6  # of each parent and round of the evolution strategy
+PARENTS, CHILDREN = 12, 6  # of the evolution strategy; children of each parent and round
 SPREAD, FALL = 0.3, 0.82  # first standard deviation of a mutation [m], and factor from round to round
 HALVED = (4, 8)  # rounds after which only the better half is kept
 STRONGEST = 24  # number of sources that a box is searched with
@@ -45,15 +45,12 @@ def evolve(
     return parents[first], float(best[first])
 
 
-def find_box(
-    left: Unexplained, draws: int = 1000, parents: int = 12, seeds: Tensor | None = None
-) -> tuple[Tensor, float]:
+def find_box(left: Unexplained, draws: int = 1000) -> tuple[Tensor, float]:
     """Return the box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
         left: what a shadow may explain.
-        draws, parents: random boxes, and how many of them evolve.
-        seeds: (s, 6) more parents.
+        draws: random boxes, of which the best evolve.
     """
     waves = left.waves * left.scorer.gains
     chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
@@ -66,9 +63,7 @@ def find_box(
         return inside_out(boxes, left.room)
 
     starts = repaired(_random(draws, left.room, left.generator))
-    starts = starts[score(starts).topk(min(parents, draws)).indices]
-    if seeds is not None:
-        starts = torch.cat([starts, repaired(seeds)])
+    starts = starts[score(starts).topk(min(PARENTS, draws)).indices]
     return evolve(starts, score, repaired, left.generator)
 
 

@@ -6,17 +6,15 @@ explain what the moved constant part leaves.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.residual import Residual
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.scene import Scene, steering
-from gsparc.physics.mirror_planes import Reflections, images
+from gsparc.models.image_sources.scene import BETAS, Scene, steering
+from gsparc.physics.mirror_planes import images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
 # Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad], log amplitudes.
@@ -24,56 +22,11 @@ STEPS = (0.02, 0.02, 0.003, 0.03, 0.05)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
-@dataclass(frozen=True)
-class ReflectionPhasePrior:
-    """Prior of phases by reflection order: that of source k is von Mises about `expected`.
-
-    Materials are nearly lossless or nearly opaque, so the phase shift of a reflection is about 0 or pi, the
-    same for most walls of a room. This fixes the offset of a wall that few receivers see, which a free phase
-    would leave ambiguous.
-
-    Attributes:
-        turn: phase shift of a reflection, 0 or pi [rad].
-        concentration: kappa, by Best and Fisher's approximation from the mean resultant length (N. I. Fisher,
-            "Statistical Analysis of Circular Data", 1993, section 4.5).
-    """
-
-    turn: float
-    concentration: float
-
-    @staticmethod
-    def of(scene: Scene) -> ReflectionPhasePrior:
-        """Estimate from a scene's phases, weighted by power."""
-        assert scene.phase is not None
-        order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
-        # Three phases lie near 0 or pi by chance.
-        if len(order) < 4:
-            return ReflectionPhasePrior(0.0, 0.0)
-        power = scene.log_amplitude.mul(2).exp() * (order > 0)
-        share, turn = max(
-            (float((power * (phase - phase[0] - order * t).cos()).sum() / power.sum()), t)
-            for t in (0.0, math.pi)
-        )
-        # At 1 the concentration is infinite.
-        share = min(max(share, 0.0), 0.97)
-        return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
-
-    def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Return phases (K,) of sequences, given the transmitter's own."""
-        return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
-
-    def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
-        """Return the negative log prior of phases (K,), the transmitter's first."""
-        return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
-
-
 def descend(
     residual: Residual,
     scene: Scene,
     paths: Paths,
     steps: int,
-    soft: float,
-    phase_prior: ReflectionPhasePrior,
 ) -> Scene:
     """Return the most likely scene of `steps` steps; paths are those of the start."""
     assert scene.phase is not None
@@ -81,17 +34,15 @@ def descend(
     start = (old.boxes, old.patches, scene.planes, scene.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
-    # Shorter memories than Adam's usual ones, of a thousand steps.
-    optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
+    optimizer = torch.optim.Adam(groups, betas=BETAS)
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
-        seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes, soft)
+        seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes)
         waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
         cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2
-        cost = cost + phase_prior.cost(phase, scene.sequences)
         if cost.item() < lowest:
             lowest, best = cost.item(), [v.detach().clone() for v in values]
         if step == steps:

@@ -109,15 +109,6 @@ class Residual:
         """Return the negative log likelihood (), in nats; differentiable."""
         return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
 
-    def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
-        """Log likelihood lost without each source's constant part (K,) [nats]."""
-        columns = self.columns(visible_share, log_amplitude)
-        inner, seen = _inner(columns, self.white)
-        inverse = Factor.of(inner).inverse
-        mean, spread = inverse @ seen, inverse.diagonal()
-        # Savage-Dickey ratio of a unit normal weight, log p(0 | y) / p(0), negated.
-        return (0.5 * (mean.square() / spread + spread.log())).float()
-
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
         """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)

@@ -7,17 +7,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import product
 
 import torch
-from torch import Tensor
 
 from gsparc.models.image_sources.backprojection import pick_apart
-from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, tangents, visible_share, within
+from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
-from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior, descend
-from gsparc.models.image_sources.clutter.residual import CandidateScorer, Residual, Unexplained
+from gsparc.models.image_sources.clutter.refine import descend
+from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
 from gsparc.models.image_sources.rows import Rows
@@ -28,21 +26,15 @@ from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_canc
 
 log = logging.getLogger(__name__)
 
-# Parameters of a box, a patch, a patch on a new plane, a new plane, a sequence.
-BOX, PATCH, MIRROR, WALL, SEQUENCE = 6, 4, 5, 3, 1
+BOX, PATCH, MIRROR, SEQUENCE = 6, 4, 5, 1  # parameters of each; a mirror is a patch on a new plane
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
-MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
-SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
-NEAR_WALL_M = 0.25  # [m]; faces closer to the end of the room are not tried as mirrors
-EPOCHS = 6  # rounds of everything, softer edges first
-SOFT_EDGES = (0.08, 0.05, 0.03)  # [m] width of edges in each epoch, the last for all that follow
+EPOCHS = 6  # rounds of everything
 STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
-MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
+MIN_GAIN = 12.0  # least [nats] of a candidate, predicted
 BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
 ORDER = 3  # largest of the reflections tried
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
-SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
 
 
 def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
@@ -69,7 +61,6 @@ class _ClutterSearcher:
         self.rows, self.generator = rows, generator
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
-        self.tried: list[SmallMirror] = []
         ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
         self.room = ends.float()
         self._refactor(scene)
@@ -78,7 +69,6 @@ class _ClutterSearcher:
     def _refactor(self, scene: Scene) -> None:
         """Factor the residual's covariance at a scene."""
         self.residual = Residual(self.rows, scene)
-        self.phase_prior = ReflectionPhasePrior.of(scene)
         self._set_scene(self.residual.scene)
 
     def _set_scene(self, scene: Scene) -> None:
@@ -120,8 +110,8 @@ class _ClutterSearcher:
         self._set_scene(before)
         return False
 
-    def _descend(self, steps: int, soft: float = SOFT) -> None:
-        scene = descend(self.residual, self.scene, self.paths, steps, soft, self.phase_prior)
+    def _descend(self, steps: int) -> None:
+        scene = descend(self.residual, self.scene, self.paths, steps)
         boxes = inside_out(scene.clutter.boxes, self.room)
         self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
@@ -133,7 +123,7 @@ class _ClutterSearcher:
             with cancelled_by(late):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
-                    self._improve(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
+                    self._improve()
                     best = min(best, self.whole, key=lambda b: b[0])
                     log.debug(
                         "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
@@ -148,117 +138,35 @@ class _ClutterSearcher:
             best = min(best, self.whole, key=lambda b: b[0])
         return best[1]
 
-    def _improve(self, soft: float) -> None:
+    def _improve(self) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        found = self._mirrors, self._patches, self._boxes, self._sequences
-        for step in (*found, partial(self._settle, soft), self._settle_boxes):
+        for step in (self._mirrors, self._patches, self._boxes, self._sequences, self._settle):
             step()
             self.whole = self.nll, self.scene
 
-    def _settle(self, soft: float) -> None:
-        self._descend_soft(soft)
-        self._drop()
-        self._refactor(self.scene)
-
-    def _settle_boxes(self) -> None:
-        self._relocate_boxes()
+    def _settle(self) -> None:
+        """Move what there is, drop what the likelihood no longer supports, and factor anew."""
         self._descend(10)
         self._drop()
         self._refactor(self.scene)
-        self._drop_sequences()
-        prior, sequences = self.phase_prior, self.scene.sequences
-        self._refactor(refine(self.rows, self.scene, STEPS, lambda v: prior.cost(v[4], sequences)))
-
-    def _descend_soft(self, soft: float) -> None:
-        """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
-
-        def change() -> None:
-            self._descend(16, soft)
-            self._descend(10)
-
-        if not self._changed(change, 0.0):
-            self._descend(10)
+        self._refactor(refine(self.rows, self.scene, STEPS))
 
     def _mirrors(self) -> None:
-        left = self._left()
-        mirrors = [mirror for mirror in find_mirrors(left, 2 * MIRRORS) if mirror.score > MIN_GAIN]
-        placed = [self._placed(mirror, left.scorer) for mirror in [*mirrors, *self._mirrors_on_boxes()]]
+        """Try small mirrors, each with its best sequences."""
         added: list[SmallMirror] = []
-        for mirror in sorted(placed, key=lambda m: -m.score):
-            if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
+        for mirror in find_mirrors(self._left(), 2 * MIRRORS):
+            if len(added) == MIRRORS or mirror.score < MIN_GAIN:
                 break
             double = any(mirror.same(other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
-    def _mirrors_on_boxes(self) -> list[SmallMirror]:
-        """Faces of boxes that are not on floor or walls, as mirrors."""
-        mirrors = []
-        for box, axis, end in product(self.scene.clutter.boxes, range(3), (0, 3)):
-            offset = float(box[axis + end])
-            if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL_M:
-                continue
-            plane = torch.zeros(4, dtype=torch.float64)
-            plane[axis], plane[3] = 1.0, offset
-            corners = box.view(2, 3) @ tangents(plane).T
-            mirror = SmallMirror(plane, torch.cat([corners.amin(0), corners.amax(0)]), 0.0)
-            if not any(mirror.same(other, SAME_FACE_M) for other in self.tried):
-                mirrors.append(mirror)
-        self.tried += mirrors
-        return mirrors
-
-    def _placed(self, mirror: SmallMirror, scorer: CandidateScorer) -> SmallMirror:
-        """The mirror at the offset along its normal that fits the phase prior best."""
-        if self.phase_prior.concentration < MIN_CONCENTRATION:
-            return mirror
-        moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
-        planes = mirror.plane.repeat(len(moves), 1)
-        planes[:, 3] += moves
-        scene, first = self.scene, len(self.scene.planes)
-        sequences = [word for i in range(len(moves)) for word in _sequences_over(first + i, scene.walls)]
-        trial = replace(scene, planes=torch.cat([scene.planes, planes])).over(sequences)
-        paths = trial.unfolding.paths(self.rows.position)
-        inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
-        inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
-        seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
-        scores, _ = scorer.score_positive(trial.unobstructed(self.rows) * seen.T * self._turns(trial))
-        total = scores.view(len(moves), -1).sum(1)
-        best = int(total.argmax())
-        return SmallMirror(planes[best], mirror.patch, float(total[best]))
-
     def _add_mirror(self, mirror: SmallMirror) -> bool:
-        """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
         scene, number = self.scene, len(self.scene.planes)
         sequences = _sequences_over(number, scene.walls)
-        endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
-        trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
-        wall = self._wide(mirror) and self._add(endless, sequences, 1.5, WALL, len(sequences))
-        return wall or self._add(trial, sequences, 1.5, MIRROR, len(sequences))
-
-    def _wide(self, mirror: SmallMirror) -> bool:
-        """Whether a mirror covers most of the room."""
-        ends = self.room @ tangents(mirror.plane).T
-        return bool((mirror.patch[2:] - mirror.patch[:2] > 0.7 * (ends[1] - ends[0]).abs()).all())
-
-    def _sequence_scores(
-        self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
-        candidates = scene.over(sequences)
-        paths = candidates.unfolding.paths(self.rows.position)
-        seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
-        waves = candidates.unobstructed(self.rows) * seen.T
-        if self.phase_prior.concentration < MIN_CONCENTRATION:
-            return *scorer.score_waves(waves), candidates.sources
-        turn = self._turns(candidates)
-        scores, gains = scorer.score_positive(waves * turn)
-        return scores, gains * turn, candidates.sources
-
-    def _turns(self, candidates: Scene) -> Tensor:
-        """(W,) complex of size 1, the phases that new sequences are expected to have."""
-        assert self.scene.phase is not None
-        expected = self.phase_prior.expected(self.scene.phase[0], candidates.sequences)
-        return torch.polar(torch.ones(()), expected)
+        clutter = scene.clutter.with_patch(mirror.patch, number)
+        trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
+        return self._add(trial, sequences, 1.5, MIRROR, len(sequences))
 
     def _add(
         self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, most: int
@@ -267,8 +175,11 @@ class _ClutterSearcher:
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
-        chosen = pick_apart(sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
+        new = scene.over(sequences)
+        paths = new.unfolding.paths(self.rows.position)
+        seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
+        scores, gains = scorer.score_waves(new.unobstructed(self.rows) * seen.T)
+        chosen = pick_apart(new.sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
@@ -308,18 +219,6 @@ class _ClutterSearcher:
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 
-    def _relocate_boxes(self) -> None:
-        """Search for every box anew, given the others."""
-        for number in range(len(self.scene.clutter.boxes)):
-            self._changed(partial(self._relocate, number), 0.5)
-
-    def _relocate(self, number: int) -> None:
-        own = self.scene.clutter.boxes[number]
-        self._set_clutter(self.scene.clutter.without(number))
-        near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
-        box, _ = find_box(self._left(), draws=400, parents=8, seeds=torch.cat([own[None], near]))
-        self._set_clutter(self.scene.clutter.with_box(box, number))
-
     def _set_clutter(self, clutter: Clutter) -> None:
         self._set_scene(replace(self.scene, clutter=clutter))
 
@@ -330,15 +229,6 @@ class _ClutterSearcher:
             parameters = BOX if number < len(clutter.boxes) else PATCH
             less = partial(self._set_clutter, clutter.without(number))
             number += not self._changed(less, -parameters * self.parameter_cost)
-
-    def _drop_sequences(self) -> None:
-        """Remove sources whose constant and varying parts both gain too little."""
-        gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
-        rest = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
-        dropped = len(gains) - len(rest)
-        if dropped:
-            fewer = partial(self._refactor, self.scene.only(rest))
-            self._changed(fewer, -dropped * self.parameter_cost)
 
 
 def _sequences_over(number: int, known: list[int]) -> list[Reflections]:

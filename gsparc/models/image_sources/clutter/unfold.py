@@ -54,7 +54,7 @@ class Unfolding:
     """All orders of the planes of K sequences with the same image, prepared for unfolding.
 
     Args:
-        transmitter: (3,) float64 [m], or each source's own (K, 3).
+        transmitter: (3,) float64 [m].
         planes: (P, 4) float64.
         sequences: K of them.
 
@@ -79,7 +79,7 @@ class Unfolding:
                 self.present[k, m] = True
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
-        chain = [transmitter.reshape(-1, 1, 1, 3).expand(*self.present.shape, 3)]
+        chain = [transmitter.expand(*self.present.shape, 3)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
         length = torch.linalg.vector_norm(used[..., :3], dim=-1, keepdim=True)
@@ -120,14 +120,14 @@ def _equivalent_sequences(
 ) -> list[list[Reflections]]:
     """Each sequence, then its permutations with the same image."""
     groups = []
-    for start, sequence in zip(transmitter.expand(len(sequences), 3), sequences, strict=True):
+    for sequence in sequences:
         others = [
             other
             for other in dict.fromkeys(permutations(sequence))
             if other != sequence and all(a != b for a, b in pairwise(other))
         ]
         if others:
-            places = images(start, planes, [sequence, *others])
+            places = images(transmitter, planes, [sequence, *others])
             same = (places[1:] - places[0]).norm(dim=1) < SAME_M
             others = [other for other, alike in zip(others, same.tolist(), strict=True) if alike]
         groups.append([sequence, *others])

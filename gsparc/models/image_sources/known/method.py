@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,16 +12,14 @@ from torch import Tensor
 
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
-from gsparc.models.image_sources.clutter.refine import ReflectionPhasePrior
-from gsparc.models.image_sources.ensemble import compact, left_out_error
+from gsparc.models.image_sources.ensemble import Look, Member, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
-from gsparc.models.image_sources.search import NOISE, SearchSettings
-from gsparc.models.image_sources.search_cache import Member, SearchCache
+from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
@@ -33,7 +31,7 @@ LEAST_SIDE = 2.0  # wavelengths; smaller rectangles hide, but mirror nothing
 MOVED_M, TURNED = 0.02, 0.01  # standard deviations of walls about those of the file [m], [rad]
 LOUDER = 0.1  # of log amplitudes about a factor per reflection
 KERNEL, QUADRATURE = KernelVisibility(0.95, 0.6, 1.5), 0.1  # where walls say who sees what
-STEPS = (40, 10, 20)  # of descent on planes and amplitudes, on the visibility kernel, on phases with them
+STEPS = (10, 80)  # of descent on the visibility kernel, then on planes, amplitudes and phases
 
 
 class KnownWallsGP(ImageSourceGP):
@@ -60,24 +58,22 @@ class KnownWallsGP(ImageSourceGP):
         return ImageSourceGP
 
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, cache: SearchCache,
-        *unused: Any,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
-        """The images in the walls, refined; no search."""
+        """The images in the walls, refined; no search, so that nothing is looked at or started from."""
         rows = row_sets[0]
-        start = self._scene(rows, settings)
+        given = self._scene(rows, settings)
 
-        def near(values: list[Tensor]) -> Tensor:
-            return walls_cost(start.planes, start.sequences, values[1], values[2])
-
-        def both(values: list[Tensor]) -> Tensor:
-            return near(values) + prior.cost(values[4], start.sequences)
+        def cost(values: list[Tensor]) -> Tensor:
+            near = walls_cost(given.planes, given.sequences, values[1], values[2])
+            return near + prior.cost(values[4], given.sequences)
 
         with late_when(budget.over):
-            scene = with_phases(rows, refine(rows, start, STEPS[0], near), QUADRATURE, self.noise_floor)
-            scene = learn_visibility(rows, scene, STEPS[1], self.kernel)
+            scene = with_phases(rows, given, QUADRATURE, self.noise_floor)
+            scene = learn_visibility(rows, scene, STEPS[0], self.kernel)
             prior = ReflectionPhasePrior.of(scene)
-            scene = refine(rows, scene, STEPS[2], both)
+            scene = refine(rows, scene, STEPS[1], cost)
         error = left_out_error(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
@@ -110,6 +106,49 @@ class KnownWallsGP(ImageSourceGP):
         )  # fmt: skip
         # without planes that neither mirror nor hide
         return replace(bare, clutter=obstacles).only([*range(len(sequences))], obstacles.plane)
+
+
+@dataclass(frozen=True)
+class ReflectionPhasePrior:
+    """Prior of phases by reflection order: that of source k is von Mises about `expected`.
+
+    Materials are nearly lossless or nearly opaque, so the phase shift of a reflection is about 0 or pi, the
+    same for most walls of a room. This fixes the offset of a wall that few receivers see, which a free phase
+    would leave ambiguous.
+
+    Attributes:
+        turn: phase shift of a reflection, 0 or pi [rad].
+        concentration: kappa, by Best and Fisher's approximation from the mean resultant length (N. I. Fisher,
+            "Statistical Analysis of Circular Data", 1993, section 4.5).
+    """
+
+    turn: float
+    concentration: float
+
+    @staticmethod
+    def of(scene: Scene) -> ReflectionPhasePrior:
+        """Estimate from a scene's phases, weighted by power."""
+        assert scene.phase is not None
+        order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
+        # Three phases lie near 0 or pi by chance.
+        if len(order) < 4:
+            return ReflectionPhasePrior(0.0, 0.0)
+        power = scene.log_amplitude.mul(2).exp() * (order > 0)
+        share, turn = max(
+            (float((power * (phase - phase[0] - order * t).cos()).sum() / power.sum()), t)
+            for t in (0.0, math.pi)
+        )
+        # At 1 the concentration is infinite.
+        share = min(max(share, 0.0), 0.97)
+        return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
+
+    def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+        """Return phases (K,) of sequences, given the transmitter's own."""
+        return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
+
+    def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+        """Return the negative log prior of phases (K,), the transmitter's first."""
+        return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
 
 
 def walls_cost(
