@@ -137,7 +137,7 @@ def logarithmic(axes: Any, fine: bool | None = None) -> None:
 
 
 def save(figure: Figure, path: Path, dpi: float = 110, also: Iterable[str] = ()) -> None:
-    """Write a figure in the format of the file's ending, atomically, and beside it in others: `pdf`, `svg`."""
+    """Write a figure in the format of its ending, atomically, and beside it in others: `pdf`, `svg`."""
     for file in (path, *(path.with_suffix(f".{form}") for form in also)):
         with whole_file(file) as partial:
             figure.savefig(partial, dpi=dpi, format=file.suffix[1:].lower() or "png")

@@ -21,7 +21,6 @@ from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_p
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
 from gsparc.ops.projection import Projection
-from gsparc.ops.settings import IMAGE_CUTOFF
 
 Call = Callable[[], object]
 ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
@@ -68,10 +67,10 @@ def model_of(count: int, projection: Projection, backend: str | None = None) -> 
 
 def cases(count: int, projection: Projection) -> Iterator[Case]:
     """Yield the kernels of a field of N Gaussians, two real channels wide."""
-    geometry = tuple(tensor.detach() for tensor in model_of(count, projection).gaussians.geometry())
+    means, quats, scales, opacities = (t.detach() for t in model_of(count, projection).gaussians.geometry())
+    geometry = means, quats, scales, opacities
     pose, draw = Pose.identity(torch.tensor([0.5, -0.5, 0.2])), torch.Generator().manual_seed(0)
     features = torch.rand(1, count, 2, generator=draw)
-    how = {"projection": projection, "cutoff": IMAGE_CUTOFF}
     size = f"{count} {projection}"
 
     def case(name: str, call: Callable[[str | None], object]) -> Case:
@@ -80,12 +79,13 @@ def cases(count: int, projection: Projection) -> Iterator[Case]:
         )
 
     def forward(backend: str | None) -> Tensor:
-        return rasterize(*geometry, features, pose, GRID, backend=backend, **how).image
+        return rasterize(*geometry, features, pose, GRID, projection=projection, backend=backend).image
 
     def backward(backend: str | None) -> object:
         leaves = [tensor.clone().requires_grad_() for tensor in (*geometry, features)]
         with torch.enable_grad():
-            image = rasterize(*leaves, pose, GRID, backend=backend, **how).image
+            of = leaves[0], leaves[1], leaves[2], leaves[3], leaves[4]
+            image = rasterize(*of, pose, GRID, projection=projection, backend=backend).image
             return torch.autograd.grad(image.sum(), leaves)
 
     def weights(backend: str | None) -> Tensor:
@@ -95,15 +95,20 @@ def cases(count: int, projection: Projection) -> Iterator[Case]:
         return mean_weights(seen, *geometry).share
 
     def plan(backend: str | None) -> Plan:
-        return make_plan(*geometry, pose, GRID, backend=backend, **how)
+        return make_plan(*geometry, pose, GRID, projection=projection, backend=backend)
 
     yield case("plan", plan)
     yield case("plan and blend, moving receiver", forward)
     frozen = freeze(plan(None), *geometry, version=0)
     # Plain PyTorch has no frozen views: its own plan, made once, is composited.
     dense = plan("reference") if count <= MOST_DENSE else None
-    again = dense and (lambda: composite(dense, *geometry, features).image)
-    yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), again)
+
+    def again() -> Tensor:
+        assert dense is not None
+        return composite(dense, *geometry, features).image
+
+    reference = None if dense is None else again
+    yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
     yield case("forward and gradients", backward)
     yield case("weights of channels", weights)
     yield from _around(count, draw)
