@@ -28,7 +28,7 @@ def data():
 @pytest.fixture(scope="module")
 def found(data, tmp_path_factory):
     context = FitContext(tmp_path_factory.mktemp("run"))
-    method = bearings(INIT, False, True, context)
+    method = bearings(INIT, True, context)
     return method, method.fit(data, Fold(ROWS, ROWS[:0], ROWS[:0]), context)
 
 
