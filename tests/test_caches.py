@@ -11,7 +11,6 @@ from gsparc.data.schema import Site, Stations
 from gsparc.evaluation.experiment.done import content
 from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
-from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.ops import SphereGrid
 
 ONE = np.ones(3)
@@ -43,7 +42,6 @@ def _keys(data, monkeypatch) -> dict[str, str]:
     with pytest.raises(Asked) as key_of_vectors:
         vector_cache.recovered(data, rows)
     found["vectors"] = str(key_of_vectors.value)
-    found["searches"] = str(ImageSourceGP()._depends_on(data, rows))
     found["cells"] = content(data)
     return found
 
