@@ -13,7 +13,7 @@ from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, in_steps
-from gsparc.training.tracking import picture
+from gsparc.training.tracking import log_picture
 
 
 @dataclass(eq=False)
@@ -54,4 +54,4 @@ class Pictures(Checked, L.Callback):
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
             true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()
             draw_spectra(true, result, rows, title, path, edges=module.site.grid.edges())
-            picture(trainer.loggers, "predictions", path, step)
+            log_picture(trainer.loggers, "predictions", path, step)

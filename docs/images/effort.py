@@ -1,4 +1,4 @@
-"""Draws `effort.png`: error over seconds of training for each `effort`, from `docs/results/fronts/effort.csv`.
+"""Draws `effort.png`: error over seconds of training by `effort`, of `docs/results/fronts/effort.csv`.
 
 python docs/images/effort.py
 

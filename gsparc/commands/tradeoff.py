@@ -90,8 +90,8 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     }  # fmt: skip
     heads, lines = tradeoff.cells_of(best, figure)
     with tracking.opened(config) as loggers:
-        tracking.picture(loggers, "operating points", run_dir / "tradeoff.png")
-        tracking.table(loggers, "operating points", heads, lines)
+        tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
+        tracking.log_table(loggers, "operating points", heads, lines)
     sheet = table(title, ["not beaten"], heads[1:], lines)
     finish(run_dir, facts, sheet, lines=tradeoff.irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.

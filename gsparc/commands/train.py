@@ -324,18 +324,18 @@ def _draw(
         for name, value in facts.items()
         if isinstance(value, (int, float)) and not name.startswith("baseline/")
     }
-    tracking.final(loggers, own)
+    tracking.log_final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
     if len(fold.test):
         title = f"{data.site.name}: test rows of {method.label}"
         draw_predictions(method, data, fold, title, run_dir / "test.png")
-        tracking.picture(loggers, "test rows", run_dir / "test.png")
+        tracking.log_picture(loggers, "test rows", run_dir / "test.png")
     table = summary.result_rows(facts, str(facts["model/label"]), config.eval_on)
-    tracking.table(loggers, "results", *table)
+    tracking.log_table(loggers, "results", *table)
     found = method.objects()
     if len(found):
         draw_found(data, found, run_dir / "found.png", _known_walls(config))
-        tracking.picture(loggers, "found", run_dir / "found.png")
+        tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 
 def task(config: DictConfig) -> float:

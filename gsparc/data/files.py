@@ -33,12 +33,12 @@ def platform_cache() -> Path:
 
 
 def is_address(path: object) -> bool:
-    """Tell whether a file is named by a URL, which reading asks somebody for."""
+    """Tell whether a file is a URL, which reading downloads."""
     return "://" in str(path)
 
 
 class Several(str):
-    """Names of files that are read as one, and of messages the text that names them all."""
+    """Paths of files that are read as one; as a string, their names joined for messages."""
 
     paths: tuple[str, ...]
 
@@ -186,7 +186,7 @@ def no_room(error: BaseException | None) -> bool:
 
 
 def set_aside(folder: Path, *patterns: str) -> bool:
-    """Rename files of an earlier run to `NAME.earlier`, over those before; returns whether there were any."""
+    """Rename files of an earlier run to `NAME.earlier`; return whether there were any."""
     found = [path for pattern in patterns for path in folder.glob(pattern)]
     return any([path.replace(f"{path}.earlier") for path in found])
 

@@ -237,7 +237,8 @@ def _cell(value: Any) -> Any:
 
 def git(folder: Path, *arguments: str) -> str | None:
     """Return what git says in a folder, None where it fails."""
-    command = ["git", "-C", str(folder), *arguments]
+    # `git status` would lock the index to refresh it, and a run that is killed then leaves the lock.
+    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
         process = subprocess.run(command, capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.TimeoutExpired):

@@ -22,7 +22,7 @@ from torch.distributed import ReduceOp
 GRACE_S = 2.0  # a process that lost another waits for that one's error to be the one that is said
 
 
-class Processes(DDPStrategy):
+class SummedGradients(DDPStrategy):
     """Processes of this machine, and of others where `trainer.num_nodes` says so, that end with training.
 
     A loss is to be the process's part of the mean over the whole batch (`Batch.share`): gradients are added
@@ -39,7 +39,7 @@ class Processes(DDPStrategy):
         self._accumulating = False
 
     @classmethod
-    def named(cls, strategy: object) -> Processes | None:
+    def named(cls, strategy: object) -> SummedGradients | None:
         """Return the one that `trainer.strategy` means: of `ddp*`; None of others."""
         if not (isinstance(strategy, str) and strategy.startswith("ddp")):
             return None

@@ -23,7 +23,7 @@ from gsparc.data import heeded
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.distributed import Processes
+from gsparc.field.distributed import SummedGradients
 from gsparc.field.module import NetworkModule
 from gsparc.field.stage_budget import SPENT, Budget
 from gsparc.training.context import FitContext
@@ -212,7 +212,7 @@ def run_stage(
     # Without validation rows nothing is looked at, however often that was asked for.
     unwatched = (f"trainer.{name}" for name in make.keywords if name != "val_check_interval")
     heeded.count("callbacks", *(["trainer"] if len(fold.val) else unwatched))
-    processes = Processes.named(make.keywords.get("strategy"))
+    processes = SummedGradients.named(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
             log.warning("published methods train in one process on the CPU, whatever trainer= says")

@@ -202,7 +202,13 @@ class PerStation(Method):
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
         if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
-            raise ValueError(f"{self.name}: places of stations are unknown, it needs them; say stations=each")
+            names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
+            needs = f"{self.name}: places of stations are unknown, it needs them"
+            if together:
+                raise ValueError(f"{needs}; say stations=each")
+            raise ValueError(
+                f"{needs} for those without training rows ({names}); give them, or split otherwise"
+            )
         return numbers
 
     def _name_of(self, number: int) -> str:

@@ -82,7 +82,9 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
         root = Factor.of(gram).root
         # C = L^-T, as C C^T is to be the inverse of the covariance.
         return Whitened(rows, root.T.contiguous(), root)
-    return with_places(rows[farthest(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name)
+    return with_places(
+        rows[pivoted_rows(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name
+    )
 
 
 def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Whitened:
@@ -100,14 +102,14 @@ def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name:
     return Whitened(places, whitening.contiguous(), weigh)
 
 
-def farthest(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
+def pivoted_rows(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
     """Return indices of up to `most` rows (n, 3), each the one that those before it tell least about.
 
     It ends when every row's variance given these is at most `enough`: a pivoted Cholesky factorization (Fine
     and Scheinberg 2001), n times the square of their number in time.
 
     >>> rows = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 0.0, 0.0]])
-    >>> farthest(rows, length=2.0, enough=0.0, name="matern32", most=2)
+    >>> pivoted_rows(rows, length=2.0, enough=0.0, name="matern32", most=2)
     tensor([0, 2])
     """
     most = min(most, len(rows))

@@ -315,7 +315,7 @@ def density_given_nearest(kernel: Kernel, sample: Sample) -> tuple[Tensor, Tenso
     return density + EXCESS * excess.square() / len(variance), amplitude
 
 
-def most_likely(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> Kernel:
+def most_likely_given_nearest(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> Kernel:
     """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
 
     Args:
@@ -361,4 +361,6 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    return most_likely(starts, sample, scale), f"{note} among {' and '.join(str(len(o)) for o in sets)}"
+    return most_likely_given_nearest(
+        starts, sample, scale
+    ), f"{note} among {' and '.join(str(len(o)) for o in sets)}"

@@ -1,4 +1,4 @@
-"""How a run comes to its effects: by probes until it is clear, which are rows of the file."""
+"""Choose the effects of a run: trace probes with all of them, drop what the tolerance does not need."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TRIAL = 2  # how much more fewer rays are to save than their trial costs, becaus
 
 @dataclass(frozen=True)
 class Changed:
-    """Errors by what the requirement does not need, at held-back receivers.
+    """Errors at held-back receivers from leaving out what the requirement does not need.
 
     Attributes:
         rows: (n,) of the survey.
@@ -63,7 +63,7 @@ class Decision:
 
     @property
     def as_chosen(self) -> bool:
-        """Whether the choice is what is simulated."""
+        """Tell whether the choice is what is simulated."""
         return (self.effects, self.samples) == (self.choice.effects, self.choice.samples)
 
     def note(self) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def pays(choice: Choice, rows: int, saved: float) -> bool:
 
 
 class Decider:
-    """Comes to the effects of one campaign, whose survey is traced with all rays."""
+    """Chooses the effects of one campaign, whose survey is traced with all rays."""
 
     def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
@@ -195,7 +195,7 @@ class Decider:
         """By the first look and, where it leaves something open, the last."""
 
         def judge(rows: np.ndarray, last: bool) -> Choice | None:
-            log.info("auto: %d probes with %s", len(rows), traced.effects)
+            log.info("auto: deciding on effects at %d receivers, traced with %s", len(rows), traced.effects)
             return auto.decide(self._probe(traced, rows), self.settings, last)
 
         return _until_clear(self.probes, judge)
@@ -205,8 +205,8 @@ class Decider:
     ) -> tuple[Choice, Changed | None]:
         """Whether a share of the rays is enough: probes, then held-back rows, with the choice and those.
 
-        Rays that are fewer are other rays, so that no attribution tells. What was traced so is no row of the
-        file: the same rows are there with all rays.
+        Fewer rays are drawn anew, so that attribution says nothing about them. Their paths are not written to
+        the file, which has the same rows with all rays.
         """
         survey, sampling = self.survey, self.campaign.sampling
         if len(survey) - len(traced.rows) > sampling.batch:  # rows of the file, which say what one costs

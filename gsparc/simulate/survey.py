@@ -37,22 +37,22 @@ class Survey:
 
     @property
     def engine(self) -> Engine:
-        """That of the first transmitter, for what all share."""
+        """Return that of the first transmitter, for what all share."""
         return self.engines[0]
 
     @property
     def transmitters(self) -> np.ndarray:
-        """(T, 3) [m]."""
+        """Return places (T, 3) [m]."""
         return np.stack([engine.transmitter for engine in self.engines])
 
     @property
     def station(self) -> np.ndarray:
-        """The transmitter (S,) of each row."""
+        """Return the transmitter (S,) of each row."""
         return np.repeat(np.arange(len(self.engines)), len(self.places))
 
     @property
     def receivers(self) -> np.ndarray:
-        """The receiver's place (S, 3) [m] of each row."""
+        """Return the receiver's place (S, 3) [m] of each row."""
         return np.tile(self.places, (len(self.engines), 1))
 
     def thinned(self, samples: int) -> Survey:
@@ -76,7 +76,6 @@ class Survey:
         parts = [
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
-        # Traced by transmitter, returned in the order asked for.
         return join(parts).take(np.argsort(order, kind="stable"))
 
 

@@ -33,12 +33,12 @@ class Cost:
 
     @property
     def seconds(self) -> float:
-        """Seconds of all stages [s]."""
+        """Return the sum over all stages [s]."""
         return sum(self.stages.values())
 
     @property
     def unused_s(self) -> float:
-        """Seconds of stages without weight [s]."""
+        """Return the sum over stages without weight [s]."""
         return sum(self.unused.values())
 
     def described(self, limited_by: Clock | None) -> str:

@@ -44,7 +44,7 @@ class Part(Logger):
 
     def log_image(self, name: str, files: Sequence[str], step: int | None = None) -> None:
         """Show a picture under the part's name, where the dashboard shows any."""
-        picture([self.whole], f"{self.part}/{name}", Path(files[0]), step)
+        log_picture([self.whole], f"{self.part}/{name}", Path(files[0]), step)
 
     def save(self) -> None:
         """Write what was logged."""
@@ -126,7 +126,7 @@ def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardL
         ) from None
 
 
-def final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:
+def log_final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:
     """Give the dashboards the figures of the whole run."""
     for logger in loggers:
         if hasattr(logger, "hparams"):  # TensorBoard sorts runs by settings and figures that come together
@@ -135,7 +135,7 @@ def final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:
             logger.log_metrics(dict(figures))
 
 
-def picture(loggers: Iterable[Any], name: str, path: Path, step: int | None = None) -> None:
+def log_picture(loggers: Iterable[Any], name: str, path: Path, step: int | None = None) -> None:
     """Give a PNG file to the dashboards that show pictures."""
     for logger in loggers:
         if hasattr(logger, "log_image"):  # Weights & Biases
@@ -147,7 +147,7 @@ def picture(loggers: Iterable[Any], name: str, path: Path, step: int | None = No
                 logger.experiment.add_image(name, np.asarray(image.convert("RGB")), step, dataformats="HWC")
 
 
-def table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def log_table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Give a table to the dashboards that show tables."""
     for logger in loggers:
         if hasattr(logger, "log_table"):

@@ -182,6 +182,10 @@ def test_stations_at_unknown_places(tmp_path):
     method = for_stations(method_class("gp")(), data)
     with pytest.raises(ValueError, match="places of stations are unknown, it needs them; say stations=each"):
         method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(tmp_path, stations="together"))
+    heard, name = rows[data.station[rows] != 1], data.site.stations.name[1]
+    with pytest.raises(ValueError, match=rf"for those without training rows \({name}\)"):
+        # It said `say stations=each` here too.
+        method.fit(data, Fold(heard, rows[:0], rows), FitContext(tmp_path, stations="each"))
 
 
 def test_an_unknown_transmitter(tmp_path):

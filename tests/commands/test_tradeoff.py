@@ -36,7 +36,7 @@ def swept(field, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         runs_in(patch, folder)
         said: list[tuple] = []
-        patch.setattr(tracking, "table", lambda loggers, *table: said.append((len(loggers), *table)))
+        patch.setattr(tracking, "log_table", lambda loggers, *table: said.append((len(loggers), *table)))
         config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}
         facts = task(config)
         monkey = {"in_multirun": lambda: True, "_swept": None}  # which is not called

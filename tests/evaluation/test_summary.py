@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from rich.console import Console
 
 import gsparc.evaluation.summary
 from gsparc.evaluation.summary import (
+    git,
     program_version,
     provenance,
     remarks,
@@ -76,6 +78,19 @@ def test_commit_is_known_inside_the_tree_only(tmp_path):
     code = f"import runpy; print(runpy.run_path({str(outside)!r})['provenance']()['git'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "None"
+
+
+def test_a_killed_run_left_a_lock_in_the_repository(tmp_path):
+    """`git status` rewrites an index whose times have changed; a SIGKILL then left `.git/index.lock`."""
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    file = tmp_path / "file"
+    file.write_text("text")
+    subprocess.run(["git", "-C", str(tmp_path), "add", "file"], check=True)
+    index = tmp_path / ".git" / "index"
+    os.utime(file, (1, 1))
+    before = index.read_bytes()
+    assert git(tmp_path, "status", "--porcelain") == "A  file"
+    assert index.read_bytes() == before
 
 
 def test_remarks_name_stand_ins_busy_machines_and_better_baselines():

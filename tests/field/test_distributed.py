@@ -9,13 +9,18 @@ from invented import invent
 from several import Kill, trained
 from states import same
 
-from gsparc.field.distributed import Processes, add_up, agreed, count
+from gsparc.field.distributed import SummedGradients, add_up, agreed, count
 
 
 def test_strategies_that_share_batches_are_known_by_name():
-    assert Processes.named("ddp")._start_method == "spawn"
-    assert Processes.named("ddp_fork_find_unused_parameters_true")._start_method == "fork"
-    assert Processes.named("auto") is Processes.named("fsdp") is Processes.named(object()) is None
+    assert SummedGradients.named("ddp")._start_method == "spawn"
+    assert SummedGradients.named("ddp_fork_find_unused_parameters_true")._start_method == "fork"
+    assert (
+        SummedGradients.named("auto")
+        is SummedGradients.named("fsdp")
+        is SummedGradients.named(object())
+        is None
+    )
 
 
 def test_alone_nothing_is_changed():

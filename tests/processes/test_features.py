@@ -6,7 +6,7 @@ import torch
 from sklearn.gaussian_process.kernels import Matern
 
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
-from gsparc.processes.features import correlation, farthest, whitened, with_places
+from gsparc.processes.features import correlation, pivoted_rows, whitened, with_places
 
 LENGTH, NOISE, NAME = 0.4, 0.01, "smooth_rough"
 
@@ -64,9 +64,9 @@ def test_places_stand_for_many_rows():
 
 def test_there_are_never_more_places_than_allowed_and_never_twins():
     known = rows(50).repeat(3, 1)
-    chosen = farthest(known, LENGTH, 0.0, NAME, 40)
+    chosen = pivoted_rows(known, LENGTH, 0.0, NAME, 40)
     assert len(set(chosen.tolist())) == 40
-    assert len(farthest(known, LENGTH, 0.0, NAME, 150)) <= 50  # the others are the same places again
+    assert len(pivoted_rows(known, LENGTH, 0.0, NAME, 150)) <= 50  # the others are the same places again
     assert torch.isfinite(whitened(known, LENGTH, NOISE, NAME, 40).whitening).all()
 
 

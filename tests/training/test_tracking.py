@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsparc.commands.train import main
 from gsparc.field.optimizer import OptimizerSettings
-from gsparc.training.tracking import Part, picture, table, tensorboard_logger, wandb_logger
+from gsparc.training.tracking import Part, log_picture, log_table, tensorboard_logger, wandb_logger
 
 BLOCK, HEAD, START = 32768, 7, 7  # bytes
 
@@ -99,8 +99,8 @@ def file(tmp_path):
 
 def test_weights_and_biases_gets_files_and_tables(file):
     logger = Records()
-    picture([logger], "predictions", file, 7)
-    table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
+    log_picture([logger], "predictions", file, 7)
+    log_table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
     assert logger.said == [("predictions", [str(file)], 7), ("results", ["method", "dB"], [["gp", "3.1"]])]
 
 
@@ -109,8 +109,8 @@ def test_tensorboard_gets_pixels_and_markdown(file, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     logger = tensorboard_logger(str(tmp_path))
-    picture([logger], "predictions", file, 7)
-    table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
+    log_picture([logger], "predictions", file, 7)
+    log_table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
     logger.finalize("success")
     found = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     (image,) = found.Images("predictions")
@@ -121,8 +121,8 @@ def test_tensorboard_gets_pixels_and_markdown(file, tmp_path):
 
 def test_other_loggers_are_left_alone(file):
     logger = type("CSV", (), {"experiment": object()})()
-    picture([logger], "predictions", file, 7)
-    table([logger], "results", ["method"], [["gp"]])
+    log_picture([logger], "predictions", file, 7)
+    log_table([logger], "results", ["method"], [["gp"]])
     assert not vars(logger)
 
 
@@ -131,7 +131,7 @@ def test_a_part_has_pictures_and_figures_under_its_name(file):
     logger.log_metrics = lambda figures, step: logger.said.append((figures, step))
     part = Part(Part(logger, "fold1"), "refit")
     part.log_metrics({"train/loss": 0.5}, 9)
-    picture([part], "predictions", file, 7)
+    log_picture([part], "predictions", file, 7)
     assert logger.said == [({"fold1/refit/train/loss": 0.5}, 9), ("fold1/refit/predictions", [str(file)], 7)]
 
 

@@ -60,12 +60,12 @@ class Viewed:
 
     @property
     def site(self) -> Site:
-        """Of the model."""
+        """Return that of the model."""
         return self.predictor.site
 
     @property
     def moving(self) -> tuple[End, ...]:
-        """Ends that can be dragged."""
+        """Return the ends that can be dragged."""
         return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
 
     def predictor_of(self, station: str | None) -> Predictor:
@@ -73,17 +73,17 @@ class Viewed:
         return self.predictor if station is None else self.predictor.at(station)
 
     def still(self, station: str | None) -> np.ndarray | None:
-        """World place (3,) [m] of the static end; None where it is unknown or moves."""
+        """Return the world place (3,) [m] of the static end; None where it is unknown or moves."""
         site = self.site if station is None else self.predictor.at(station).site
         place = site.static_position
         return None if place is None else place + site.origin
 
     def box(self) -> np.ndarray:
-        """(2, 3) world corners of where the moving end was [m]."""
+        """Return world corners (2, 3) of where the moving end was [m]."""
         return np.asarray(self.site.moving_box[:, -3:] + self.site.origin)
 
     def heights(self) -> tuple[float, float]:
-        """Between which a plane can be lifted [m], to the centimetre."""
+        """Return the lowest and the highest height of a plane [m], to the centimetre."""
         low, high = (float(z) for z in (self.site.box + self.site.origin)[:, 2])
         if high - low <= LEAST_HEIGHT_M:
             low, high = low - 1.5, high + 1.5
@@ -91,7 +91,7 @@ class Viewed:
         return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
 
     def rows(self, station: str | None) -> np.ndarray:
-        """Rows of a station."""
+        """Return rows of a station."""
         if self.data is None:
             return np.zeros(0, np.int64)
         if station is None or self.data.station is None or self.site.stations is None:
@@ -100,7 +100,7 @@ class Viewed:
         return np.flatnonzero(self.data.station == number)
 
     def measured(self, station: str | None) -> Measured | None:
-        """Values of a station; None without data."""
+        """Return values of a station; None without data."""
         if self.data is None:
             return None
         data, rows = self.data, self.rows(station)

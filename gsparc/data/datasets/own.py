@@ -51,7 +51,7 @@ def raw_of_own(
     """
     raw, notes = raw_of(path, columns, stations_file, cell_m)
     raw = understood(raw, **settings)
-    campaign = campaign_of(raw)
+    campaign = choice_by_arrays(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
     for note in notes:
@@ -109,13 +109,13 @@ CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtileP
 LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind in CAMPAIGNS}
 
 
-def campaign_of(raw: Raw) -> str | None:
+def choice_by_arrays(raw: Raw) -> str | None:
     """Return the choice of conf/dataset that reads a file with these arrays; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
     return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
-def release_of(path: Path) -> str | None:
+def choice_by_path(path: Path) -> str | None:
     """Return the choice of conf/dataset that reads a release, file or folder; None where none does."""
     folder = path.is_dir()
     for kind in CAMPAIGNS:
@@ -142,7 +142,7 @@ def read_any(
     """
     path = Path(path)
     # Releases before anything else: their folders may hold tables that look like one's own.
-    release = release_of(path)
+    release = choice_by_path(path)
     if release is not None:
         raw, notes = Noted(LOADERS[release](path), (f"this is the release of dataset={release}",))
     elif path.is_dir():
@@ -154,7 +154,7 @@ def read_any(
         return Reading(load_rfid(path), ())
     else:
         raw, notes = raw_of(path, columns, stations_file)
-        if (campaign := campaign_of(raw)) is not None:
+        if (campaign := choice_by_arrays(raw)) is not None:
             raw, notes = Noted(LOADERS[campaign](path), (f"this is a file of dataset={campaign}",))
     reading = interpret(understood(raw, **settings), path)
     return Reading(reading.data, (*notes, *reading.notes))

@@ -51,12 +51,12 @@ class Condition:
 
     @property
     def changes_training(self) -> bool:
-        """Whether it changes what is learned from."""
+        """Tell whether it changes what is learned from."""
         return self.what not in ("none", "query")
 
     @property
     def learned(self) -> Condition:
-        """The condition whose training stands for this one's."""
+        """Return the condition whose training stands for this one's."""
         # A query's error changes nothing that is learned: one training serves all of them.
         return self if self.changes_training else Condition()
 
@@ -65,12 +65,12 @@ class Condition:
         return folder / str(self.learned).replace(" ", "-") / checkpoint.MODEL
 
     def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Its part of a cell's summary."""
+        """Return its part of a cell's summary."""
         names = {"figure": facts["figure"], "model": str(self.model(folder))}
         return {**asdict(self), **names, **under(facts, str(self))}
 
     def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
-        """Data and rows of a fold under this condition."""
+        """Return data and rows of a fold under this condition."""
         if self.what == "keep":
             return data, thinned(fold, self.amount, seed)
         if self.what == "directions":
@@ -83,7 +83,7 @@ class Condition:
         return replace(moved, position_std=known), fold
 
     def tested_on(self, data: Measurements, split: Split, seed: int) -> Measurements:
-        """Data whose test rows are asked about."""
+        """Return data whose test rows are asked about."""
         return with_position_errors(
             data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed
         )
@@ -97,7 +97,7 @@ NAMES = ("variant", "what", "amount", "figure", "value", "spread")
 
 
 def facts_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """`study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, seconds, milliseconds."""
+    """Return figures as `study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, s, ms."""
     facts: dict[str, Any] = {}
     for row in rows.to_dict("records"):
         stem = f"study/{row['variant']}" + (
@@ -114,7 +114,7 @@ class Study:
     """What is compared.
 
     Attributes:
-        variants: what makes a method, or what chooses it, by name, in the order of the table.
+        variants: factories of methods by name, in the order of the table.
         conditions: each variant is fitted once per condition that changes what is learned from.
         rounds: trainings of each, in turns; round r uses seed + r.
         seed: of the first round.
@@ -135,7 +135,7 @@ class Study:
         Args:
             data, split: as they are before any condition.
             context: of every fit, but for its folder and seed.
-            state: that results are of.
+            state: what results depend on; stored ones of another state are not reused.
 
         Returns:
             A row per variant and condition, columns `ROW` (those of `study.csv`).
@@ -266,7 +266,7 @@ class Positions:
     train_errors: bool = True
 
     def conditions(self) -> list[Condition]:
-        """No error, then of a `query`, in training (`train`, or `train_known` in size), of `directions`."""
+        """Return no error, then of a `query`, in training (`train_known`: of known size), of `directions`."""
         errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
         return [
             Condition(),
@@ -301,9 +301,9 @@ class Measured:
 
 
 def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
-    """Move where the end of `rows` is believed by N(0, error_m^2) per coordinate; all else stays the same.
+    """Add errors N(0, error_m^2) per coordinate to the recorded places of `rows`; measured values stay.
 
-    Rows of one place, heard by several stations, are believed to be at one place.
+    Rows of one place, heard by several stations, have one error.
     """
     # One error a place, or averages over rows of one place would shrink it.
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
@@ -314,7 +314,7 @@ def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, s
 def with_direction_errors(
     data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
 ) -> Measurements:
-    """Directions of arrival as a receiver measures them; all else the same.
+    """Disturb directions of arrival as a receiver measures them; all else stays.
 
     Args:
         data: with directions.
@@ -351,7 +351,7 @@ def thinned(fold: Fold, keep: float, seed: int) -> Fold:
         seed: of the choice.
     """
     every = len(fold.train) + len(fold.val)
-    # `keep` up to 1 is a share, above it a number of rows; never more than there are.
+    # Never more than there are.
     total = min(round(keep * every if keep <= 1 else keep), every)
     # One validation row at least, where there is one: it decides when to stop.
     validate = min(max(round(total * len(fold.val) / every), 1), len(fold.val))

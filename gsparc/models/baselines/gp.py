@@ -24,7 +24,7 @@ from gsparc.models.reduced import Filled, MeanOnly
 from gsparc.models.target_rows import entry_variance, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.nearest import Sample, Values, given, most_likely
+from gsparc.processes.nearest import Sample, Values, given, most_likely_given_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
 from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
@@ -273,7 +273,7 @@ def kernel_given_nearest(
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
-    result = most_likely([start], sample, pdist(places[row]))
+    result = most_likely_given_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note

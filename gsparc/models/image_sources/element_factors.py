@@ -47,7 +47,7 @@ def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     each[known] = estimate / estimate[0]
     factors = torch.from_numpy(each.astype(np.complex64))
     target = rows.target * factors[rows.element, None]
-    scale = target.abs().square().mean().sqrt()  # a common factor is the sources' to have
+    scale = target.abs().square().mean().sqrt()  # sources absorb a common factor
     nll = Posterior(replace(rows, target=target / scale), scene).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
     gain = conditioned.nll - (nll - jacobian)

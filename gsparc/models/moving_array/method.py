@@ -58,7 +58,7 @@ class Spectra:
 
     @property
     def receivers(self) -> Tensor:
-        """(n, 3) float32 [m]."""
+        """Return places (n, 3) float32 [m]."""
         return torch.from_numpy(self.places).float()
 
     def at(self, rows: np.ndarray) -> Spectra:
@@ -113,7 +113,7 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Sources seen through the array, and a residual where one is fitted."""
+        """Name sources seen through the array, and a residual where one is fitted."""
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def knobs(self) -> tuple[str, ...]:
@@ -228,7 +228,7 @@ class MovingArrayField(Differentiable, ClosedForm):
             relative.append(error / image.square().mean((1, 2)).clamp_min(1e-12))
             errors.append(error)
             features.append(image_features(images, energy[part]))
-        # two images drawn at random differ by twice the variance
+        # Two images drawn at random differ by twice the variance.
         prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
         reach = self.found.kernel.length
         self.errors = fit_errors(

@@ -113,7 +113,7 @@ def find_sources(
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
-        # Of powers the receiver nearest to a source would decide the sum alone.
+        # Amplitudes: with powers the nearest receiver would decide alone.
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
@@ -183,7 +183,7 @@ MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which 
 
 
 def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
-    """Whether images (n, H, W) are amplitude (2) or power (1), and the share of energy outside the lags."""
+    """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
     residual = {}
     for exponent in (2, 1):
         power = images**exponent

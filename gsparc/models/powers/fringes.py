@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
-from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
+from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_weights
 from gsparc.processes.nearest import Values, given
 from gsparc.processes.powers import Rows, conditioned
 from gsparc.processes.prior import Posterior, Prior
@@ -185,7 +185,7 @@ def find_fringes(
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
-            weights.append(fit_waves(columns[seen], rows.decibels[seen] - level, rng))
+            weights.append(fit_weights(columns[seen], rows.decibels[seen] - level, rng))
         powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
         blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)

@@ -68,7 +68,7 @@ def decibels_of(field: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.abs(field) ** 2 + FLOOR)
 
 
-def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def fit_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
 
     A weight's prior is complex normal of variance 1.

@@ -71,7 +71,7 @@ class ImageProcess(LearnedField):
                 self.most_steps = 0
             choices, _ = resolve(self.settings, self.init.name, data.site)
             log.info(
-                "training %s by rendering: %d Gaussians, terms %s, init=%s; callbacks %s",
+                "training %s by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
                 GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
                 ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
             )  # fmt: skip

@@ -20,14 +20,14 @@ from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Filled, coarser
 from gsparc.ops import Pose, SphereGrid
-from gsparc.processes.features import correlation, farthest, with_places
+from gsparc.processes.features import correlation, pivoted_rows, with_places
 
 if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
 
 
 def through_array(model: GaussianModel) -> bool:
-    """Whether images are formed by an array from the splatted ones: on pixels of its own."""
+    """Return whether Gaussians emit fields that an array images, on pixels of its own."""
     return model.settings.response.array
 
 
@@ -115,7 +115,7 @@ def distil_features(model: GaussianModel, share: float) -> None:
     own.diagonal().add_(noise)
     count, width, channels = emission.weight2.shape
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
-    chosen = farthest(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
+    chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = with_places(places[chosen], places, length, noise, old.kernel)
     result = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())

@@ -29,7 +29,7 @@ class Ground:
 
     Attributes:
         allowed: which of places (n, 3) [m], world, are not in, on or above what stands there (n,) bool.
-        lift: (n, 3) of places whose z counts from the ground (or roof), from the world's zero [m].
+        lift: turns heights above ground (or roof) of places (n, 3) into world z [m].
         open_sky: whether nothing is above those that are allowed.
     """
 

@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, nearest, sampled
-from gsparc.models.powers.waves import basis_of, decibels_of, fit_waves
+from gsparc.models.powers.waves import basis_of, decibels_of, fit_weights
 from gsparc.ops import Pose
 
 LIGHT, WAVELENGTH = 299_792_458.0, 0.3
@@ -59,7 +59,7 @@ def test_powers_are_fitted_by_waves():
     count = columns.shape[1]
     true = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / 2**0.5
     decibels = decibels_of(columns @ true)
-    found = [decibels_of(columns @ fit_waves(columns, decibels, rng)) for _ in range(4)]
+    found = [decibels_of(columns @ fit_weights(columns, decibels, rng)) for _ in range(4)]
     assert min(np.median(np.abs(one - decibels)) for one in found) < 0.5
 
 

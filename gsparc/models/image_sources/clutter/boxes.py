@@ -60,15 +60,15 @@ def find_box(left: Unexplained, draws: int = 1000) -> tuple[Tensor, float]:
         return left.scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
 
     def repaired(boxes: Tensor) -> Tensor:
-        return inside_out(boxes, left.room)
+        return clipped_to(boxes, left.room)
 
     starts = repaired(_random(draws, left.room, left.generator))
     starts = starts[score(starts).topk(min(PARENTS, draws)).indices]
     return evolve(starts, score, repaired, left.generator)
 
 
-def inside_out(boxes: Tensor, room: Tensor) -> Tensor:
-    """Return boxes (m, 6) cut to the room, their corners in order."""
+def clipped_to(boxes: Tensor, room: Tensor) -> Tensor:
+    """Return boxes (m, 6) cut to the room; of one outside, low corners lie above high ones."""
     low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
     return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
 

@@ -142,7 +142,13 @@ class CandidateScorer:
         return self.root.square().sum(0).view(2, -1).mean(0)
 
     def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
-        """Return nats (m,) of adding waves (n, K), times each `share` (b, K, n) under b of m candidates."""
+        """Return the log likelihood (m,) [nats] that m candidates gain by adding waves times their shares.
+
+        Args:
+            candidates: (m, ...), taken in blocks of b.
+            share: maps b candidates to shares (b, K, n).
+            waves: (n, K) complex.
+        """
         scores = []
         for part in candidates.split(BLOCK):
             raise_if_cancelled()

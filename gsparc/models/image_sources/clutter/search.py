@@ -12,7 +12,7 @@ import torch
 
 from gsparc.models.image_sources.backprojection import pick_apart
 from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
-from gsparc.models.image_sources.clutter.boxes import find_box, inside_out
+from gsparc.models.image_sources.clutter.boxes import clipped_to, find_box
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
 from gsparc.models.image_sources.clutter.refine import descend
 from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
@@ -112,7 +112,7 @@ class _ClutterSearcher:
 
     def _descend(self, steps: int) -> None:
         scene = descend(self.residual, self.scene, self.paths, steps)
-        boxes = inside_out(scene.clutter.boxes, self.room)
+        boxes = clipped_to(scene.clutter.boxes, self.room)
         self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
     # ---- the loop ----

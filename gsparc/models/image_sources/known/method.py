@@ -29,13 +29,13 @@ log = logging.getLogger(__name__)
 
 LEAST_SIDE = 2.0  # wavelengths; smaller rectangles hide, but mirror nothing
 MOVED_M, TURNED = 0.02, 0.01  # standard deviations of walls about those of the file [m], [rad]
-LOUDER = 0.1  # of log amplitudes about a factor per reflection
+LOG_AMPLITUDE_STD = 0.1  # about a factor per reflection
 KERNEL, QUADRATURE = KernelVisibility(0.95, 0.6, 1.5), 0.1  # where walls say who sees what
 STEPS = (10, 80)  # of descent on the visibility kernel, then on planes, amplitudes and phases
 
 
 class KnownWallsGP(ImageSourceGP):
-    """See `ImageSourceGP`; sources are the images in walls of a file, whose numbers are not searched for.
+    """See `ImageSourceGP`; sources are the images in walls of a file, without a search for their number.
 
     Args:
         walls: in the coordinates of the measurements.
@@ -161,4 +161,4 @@ def walls_cost(
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     law = torch.stack([torch.ones_like(order), order], 1)
     left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
-    return (moved + turned + left.square().sum() / LOUDER**2) / 2
+    return (moved + turned + left.square().sum() / LOG_AMPLITUDE_STD**2) / 2
