@@ -48,6 +48,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     before += "" if predictor is None or predictor.site.stations is None else " of all stations"
     if plan.walk:
         kind = "walk" if config.walkable is None else "drive"
-        before += f", a {kind} of {plan.length_m:.4g} m, straight from place to place"
+        before += f", a {kind} of {plan.length_m:.0f} m, straight from place to place"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
     return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")

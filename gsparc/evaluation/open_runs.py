@@ -369,10 +369,15 @@ def store(
     threshold = confidence.threshold_of(kind_used, choice)
     known, kernel = confidence.known_positions(data, fold), confidence.position_kernel(data, fold)
     stored = confidence.Trusted(kind_used, threshold, promise, known, kernel)
-    confidence.keep(path, stored)
-    before = confidence.trusted_of(run.stored[0].extra).kind or "the model's own"
+    earlier = confidence.trusted_of(run.stored[0].extra)
+    before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
     kind_changed = f"confidence={kind_used}, before: {before}; "
+    if kind == "auto" and not np.isfinite(threshold):
+        # Without a promise a choice by chance would replace what falls away from the measurements.
+        stored, kind_changed = earlier, f"confidence stays {before}, the checkpoint as it was; "
+    else:
+        confidence.keep(path, stored)
     if np.isfinite(threshold):
         of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"

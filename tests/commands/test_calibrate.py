@@ -92,15 +92,20 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     run.stored = [SimpleNamespace(extra={})]
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
     monkeypatch.setattr(command, "rows_of", lambda *_: None)
-    for name in ("known_positions", "position_kernel", "keep"):
+    for name in ("known_positions", "position_kernel"):
         monkeypatch.setattr(command.confidence, name, lambda *_: None)
+    kept = []
+    monkeypatch.setattr(command.confidence, "keep", lambda *stored: kept.append(stored))
     monkeypatch.setattr(command.confidence, "gather", lambda *_: evidence)
     how = "auto", False, 0
     stored, said = command.store("", {}, {}, Guarantee(-40.0), *how)
-    assert f"confidence={stored.kind}, before: the model's own; " in said  # it changed without a word
+    # A choice among confidences replaced the model's own though nothing was promised.
+    assert "confidence stays the model's own, the checkpoint as it was; " in said and not kept
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
-    assert -25 < better < 0 and "accepted from" in command.store("", {}, {}, Guarantee(better), *how)[1]
+    assert -25 < better < 0
+    stored, said = command.store("", {}, {}, Guarantee(better), *how)
+    assert f"confidence={stored.kind}, before: the model's own; accepted from" in said and len(kept) == 1
     assert "no threshold" in command.store("", {}, {}, Guarantee(better - 1), *how)[1]
     evidence.error[:] = 10.0
     assert "no limit_db= up to 6 is kept" in command.store("", {}, {}, Guarantee(), *how)[1]

@@ -74,7 +74,7 @@ class Plan:
         if not len(self.places) or gain >= WORTH * self.before_db:
             return ""
         return (
-            f"hardly worth it: {len(self.places)} places (a walk of {self.length_m:.4g} m) take {gain:.2g} "
+            f"hardly worth it: {len(self.places)} places (a walk of {self.length_m:.0f} m) take {gain:.2g} "
             f"dB off {self.before_db:.2f} dB, {self.scatter_db:.2f} dB of which are the scatter of single "
             "measurements; area=... where less was measured needs them more"
         )

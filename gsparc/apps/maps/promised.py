@@ -72,7 +72,7 @@ def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
     if share and len(field.stations) > 1:
         notes.append(
             f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
-            "the strongest and above its floor; noise_db=... says where noise lies"
+            "the strongest and above its floor (noise_db=, or what its receiver hears)"
         )
     if coverage is None:
         own = "intervals are the model's own deviations, and places far from data are not refused"

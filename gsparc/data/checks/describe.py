@@ -36,7 +36,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
         ("scale", "" if scale == 1 else f"stored targets are the measurements divided by {scale:.4g}"),
-        ("censored", f"of {len(data)} powers {weak} were too weak, {strong} too strong to be measured"
+        ("censored", f"of {len(data)} powers {weak} lie under a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
         ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
         ("phases", "" if phases is None else str(phases)),
