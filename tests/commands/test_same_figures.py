@@ -17,6 +17,12 @@ CASES = {
     "a station of the city": ("dataset=powder", "dataset.file", "real/powder-rss-462mhz.npz",
                               "dataset.stations=[6]", "dataset.max_rows=1500"),
     "a room": ("dataset=newrf", "dataset.file", "newrf-conference.npz"),
+    "several antennas": ("dataset=techtile", "dataset.file", "real/techtile-csi-920mhz.npz",
+                         "dataset.stations=[1,5,9]", "dataset.runs=[EXP005]", "stations=together"),
+    "OFDM of runs": ("dataset=wsr", "dataset.file", "ofdm/wsr-los-a.npz", "dataset.stations=[0]",
+                     "dataset.max_rows=600"),
+    "stations of the city": ("dataset=powder", "dataset.file", "real/powder-rss-462mhz.npz",
+                             "dataset.stations=[6,7,9]", "dataset.max_rows=700", "stations=together"),
 }  # fmt: skip
 SAME = ("model/init", "model/made", "model/steps", "model/num_gaussians", "model/limited_by_clock")
 
