@@ -98,18 +98,23 @@ def each(source: str, methods: Sequence[str], data: Measurements, fold: Fold) ->
     """Write a line of every method, each fitted in a child, whose memory is then no longer held."""
     for name in methods:
         make(name)  # imports it, so that no child does
+    failed = []
     for name in methods:
         # fork, not spawn: the child shares the measurements' memory, which is then counted once.
         child = os.fork()
         if child == 0:
+            status = 1
             try:
                 measured(source, name, data, fold)
+                status = 0
             except Exception:
                 traceback.print_exc()
             finally:
                 # Without cleanup: handlers of the parent must not run in the child.
-                os._exit(0)
-        os.waitpid(child, 0)
+                os._exit(status)
+        failed += [name] * bool(os.waitpid(child, 0)[1])
+    if failed:
+        raise SystemExit(f"{source}: {', '.join(failed)} failed, see above")
 
 
 def main(source: str, *rest: str) -> None:
