@@ -8,6 +8,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.geojson import write_line
 from gsparc.apps.maps.pictures import draw_plan_picture
 from gsparc.apps.maps.planning import plan_next
 from gsparc.apps.maps.promised import promise_of
@@ -35,7 +36,12 @@ def task(config: DictConfig) -> dict[str, Any]:
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
     # Rows are in the order of the walk; the rank is that of their gains.
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
+    walk = len(plan.path) > 0
+    columns |= {"walked_m": plan.metres.round(1)} if walk else {}
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
+    if walk:
+        origin = None if predictor is None else predictor.site.georeference
+        write_line(run_dir / "plan.geojson", plan.path, origin)
     draw_plan_picture(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(plan.places), "plan/expected_error_db": plan.after_db,
@@ -46,8 +52,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     before += "" if predictor is None or predictor.site.stations is None else " of all stations"
-    if plan.walk:
-        kind = "walk" if config.walkable is None else "drive"
-        before += f", a {kind} of {plan.length_m:.0f} m, straight from place to place"
+    if walk:
+        kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
+        before += f", a way of {plan.length_m:.0f} m, {kind}"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
     return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")

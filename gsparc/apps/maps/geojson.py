@@ -11,6 +11,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError, reason
+from gsparc.data.files import whole_file
 from gsparc.data.links.georeference import Georeference
 
 if TYPE_CHECKING:
@@ -85,3 +86,11 @@ def read_shapes(
             "was trained in metres about an unknown origin, which degrees mean nothing to"
         )
     return shapely.union_all(shapely.make_valid(polygons)), list(lines)
+
+
+def write_line(path: Path, corners: np.ndarray, origin: Georeference | None) -> None:
+    """Write a line of corners (n, 2) [m], in degrees where their place on Earth is known."""
+    if origin is not None:
+        corners = np.column_stack(origin.to_degrees(corners)[::-1])
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps({"type": "LineString", "coordinates": corners.tolist()}))

@@ -304,8 +304,8 @@ def draw_plan_picture(
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
         draw_measured(before, places)
-    how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
-    after.plot(*batch.places[:, :2].T, linestyle="-" if batch.walk else "", linewidth=1, zorder=3, **how)
+    after.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
+    after.plot(*batch.places[:, :2].T, "o", color="red", markeredgecolor="white", markersize=6, zorder=3)
     for number, place in enumerate(batch.places[:60], 1):
         after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
                        path_effects=OUTLINE, zorder=4)  # fmt: skip

@@ -209,7 +209,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         above = np.full(len(asked), height) if where.height is None else where.height
         return in_world(replace(asked, ends={end: replace(where, height=above)}), site)[end]
     if sites is not None:
-        every = walkable_places(sites, grid, predictor.site.georeference, "sites")
+        every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
     few = every[evenly(len(every), count)]

@@ -19,6 +19,7 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import answering
 from gsparc.apps.maps.promise import Promise
+from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
@@ -40,12 +41,13 @@ class Plan:
             measured [dB].
         before_db: the same before any of them is.
         chosen: (n,) int64, which the greedy choice took first, 0 to n - 1.
-        length_m: of the walk in this order [m].
+        length_m: of the shortest walk through them that was found [m].
         grid: the area.
         error_before, error_after: (S,) expected error at `at` [dB].
         at: (S, 3) places that errors were averaged over [m].
         scatter_db: of these errors, that of a single measurement, which no other place takes away [dB].
-        walk: whether the order is one.
+        metres: (n,) walked at each place [m]; (0,) where the order is that of gains.
+        path: (m, 2) corners of the walk [m], along the lines of `walkable`; (0, 2) likewise.
         stopped: why there are fewer than were asked for; "" where there are not.
     """
 
@@ -59,7 +61,8 @@ class Plan:
     error_after: np.ndarray
     at: np.ndarray
     scatter_db: float
-    walk: bool = False
+    metres: np.ndarray
+    path: np.ndarray
     stopped: str = ""
 
     @property
@@ -97,8 +100,8 @@ def plan_next(
         predictor: of powers; None before anything is measured, with `area` or `plan`.
         count: places wanted.
         area, height_m, plan: see `grid_of`; with a promise and neither area nor plan, what it answers for.
-        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as corridors; None: the
-            whole area.
+        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets, along which
+            the walk then goes; None: the whole area.
         stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
         promise: evidence of held-out blocks, which scales the model's own variances.
         least_gain_db: stop where a place takes less than this off the expected error.
@@ -114,29 +117,31 @@ def plan_next(
     check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
     origin = None if predictor is None else predictor.site.georeference
     grid = coarse_grid(predictor, area, height_m, plan, promise)
-    targets = grid.places()
-    allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
-    places, free, wanted = _joined(targets, allowed)
+    targets, streets = grid.places(), None
+    places, first = targets, 0  # candidates are the places from `first` on
+    if walkable is not None:
+        allowed, streets = walkable_places(walkable, grid, origin)
+        places, first = np.concatenate([targets, allowed]), len(targets)
     # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
         unknown = before_measuring(places, length_m)
     else:
         names, _ = answering(predictor, stations)
         unknown = unknown_of(predictor, places, names, promise, other_end)
-    begin = None if start is None else _start(start)
-    tour = Tour(begin, route_m)
-    first = _expected(unknown, wanted)
-    before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-    chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
-    after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    begin = np.zeros((0, 2)) if start is None else _start(start)
+    ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
+    tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
+    wanted = np.arange(len(places)) < len(targets)
+    before, before_db = mean_error(unknown), _expected(unknown, wanted)
+    chosen, expected, stopped = greedy(unknown, first, wanted, count, least_gain_db, tour)
     walk = (walkable is not None if route is None else route) or route_m is not None
-    order = tour.number if walk else np.arange(len(chosen))
-    picked = places[chosen] if len(chosen) else np.zeros((0, 3))
+    order = np.array([chosen.index(one) for one in tour.stops], np.int64) if walk else np.arange(len(chosen))
+    path = ways.through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
-        picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
-        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted],
-        scatter, walk, stopped,
+        places[first:][np.array(chosen, np.int64)[order]], np.array(expected)[order], before_db, order,
+        float(tour.metres[-1:].sum()), grid, before[wanted], mean_error(unknown)[wanted], places[wanted],
+        scatter, tour.metres if walk else np.zeros(0), path, stopped,
     )  # fmt: skip
 
 
@@ -163,13 +168,15 @@ def coarse_grid(
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
-    """Places (n, 3) in polygons or along lines of a file."""
+def walkable_places(
+    path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable"
+) -> tuple[np.ndarray, Streets | None]:
+    """Return places (n, 3) in polygons or along lines of a file, and these lines; None: it holds none."""
     left, right, south, north = grid.extent
     area, lines = read_shapes(path, key, origin, True, max(right - left, north - south))
-    from shapely import contains_xy, get_coordinates
+    from shapely import contains_xy
 
-    points = [np.zeros((0, 2))]
+    points, streets = [np.zeros((0, 2))], None
     if not area.is_empty:
         low, high = np.reshape(area.bounds, (2, 2))
         # Four times too many, since bounds of a corridor's polygon are mostly empty.
@@ -177,41 +184,36 @@ def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str
         x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
         points.append(every[contains_xy(area, every)])
-    for line in lines:
-        at = np.linspace(0, line.length, max(2, int(np.ceil(2 * line.length / grid.step)) + 1))
-        points.append(get_coordinates(line.interpolate(at)))
-    places = np.unique(np.concatenate(points), axis=0)
+    if lines:
+        streets = Streets.of(lines, grid.step / 2)
+        # One of each step's square: a street with many bends has no more of them.
+        square = np.unique((streets.node / grid.step * 2).round(), axis=0, return_index=True)[1]
+        points.append(streets.node[square])
+    places = np.concatenate(points)
     if not len(places):
         raise DataError(f"{key}={path}: its polygons are too small for any place")
     if len(places) > CANDIDATES:
         # A fixed seed: the same file gives the same candidates.
         places = places[np.random.default_rng(0).permutation(len(places))[:CANDIDATES]]
-    return np.column_stack([places, np.full(len(places), grid.height)])
-
-
-def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places (S, 3), which are candidates and which are targets (S,) bool."""
-    if targets is allowed:
-        every = np.ones(len(targets), bool)
-        return targets, every, every.copy()
-    places = np.concatenate([targets, allowed])
-    wanted = np.arange(len(places)) < len(targets)
-    return places, ~wanted, wanted
+    return np.column_stack([places, np.full(len(places), grid.height)]), streets
 
 
 def greedy(
-    unknown: list[ErrorCovariance], free: np.ndarray, wanted: np.ndarray, places: np.ndarray, count: int,
-    least_gain_db: float, tour: Tour,
+    unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
+    tour: Tour,
 ) -> tuple[list[int], list[float], str]:  # fmt: skip
-    """Chosen places, expected error after each, and why it stopped early."""
-    free = free.copy()
+    """Chosen candidates, expected error after each, and why it stopped early.
+
+    Candidates are the places from `first` on, by whose numbers they are in `tour`.
+    """
+    free = np.ones(len(wanted) - first, bool)
     chosen: list[int] = []
     expected: list[float] = []
     error = _expected(unknown, wanted)
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
-        gains = np.sum([one.gains(wanted) for one in unknown], axis=0)
-        possible = free & tour.within(places)
+        gains = np.sum([one.gains(wanted)[first:] for one in unknown], axis=0)
+        possible = free & tour.within()[: len(free)]
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"
@@ -222,70 +224,26 @@ def greedy(
         if gain < least_gain_db:
             return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
-            one.measured(best)
+            one.measured(first + best)
         error = _expected(unknown, wanted)
         chosen.append(best)
         expected.append(error)
-        tour.add(places[best])
+        tour.add(best)
         free[best] = False
     return chosen, expected, ""
 
 
+def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
+    """Return the root of the mean variance over stations at each place (S,) [dB]."""
+    return np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+
+
 def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
-    return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
+    return float(np.sqrt(np.mean(mean_error(unknown)[wanted] ** 2)))
 
 
 def _start(value: Sequence[float]) -> np.ndarray:
     place = finite(value)
     if place.shape not in ((2,), (3,)):
         raise DataError(f"start={value}: [x,y] in metres is needed")
-    return place[:2]
-
-
-class Tour:
-    """An open walk that grows place by place.
-
-    Args:
-        start: (2,) where it starts [m]; None: at whichever place.
-        longest: metres it may have; None: any.
-    """
-
-    def __init__(self, start: np.ndarray | None, longest: float | None) -> None:
-        self.start, self.longest = start, longest
-        self.stops, self.number = np.zeros((0, 2)), np.zeros(0, np.int64)  # in the order of the walk
-
-    def within(self, places: np.ndarray) -> np.ndarray:
-        """Which of places (n, 3) can be added, (n,) bool."""
-        if self.longest is None:
-            return np.ones(len(places), bool)
-        length = self.length_of(self.stops, self.start)
-        return self._longer(places[:, :2]).min(axis=0) + length <= self.longest
-
-    def add(self, place: np.ndarray) -> None:
-        """Put a place (3,) where it lengthens the walk least."""
-        at = int(self._longer(place[None, :2])[:, 0].argmin())
-        self.stops = np.insert(self.stops, at, place[:2], axis=0)
-        self.number = np.insert(self.number, at, len(self.number))
-
-    @staticmethod
-    def length_of(places: np.ndarray, start: np.ndarray | None) -> float:
-        """Return the length of a walk through places (n, 2 or 3) in their order [m]."""
-        stops = places[:, :2] if start is None else np.vstack([start, places[:, :2]])
-        return float(np.hypot(*np.diff(stops, axis=0).T).sum()) if len(stops) > 1 else 0.0
-
-    def _ends(self) -> np.ndarray:
-        """Stops (n + 2, 2) with what is before and after them; NaN where there is nothing."""
-        nothing = np.full(2, np.nan)
-        return np.vstack([nothing if self.start is None else self.start, self.stops, nothing])
-
-    def _longer(self, places: np.ndarray) -> np.ndarray:
-        """What each of places (n, 2) adds to the walk before each stop, or at its end: (stops + 1, n) [m]."""
-        stops = self._ends()
-        to = _apart(stops[:, None], places)
-        # Cheapest insertion: the way over the new place less the way there was.
-        return to[:-1] + to[1:] - _apart(stops[:-1], stops[1:])[:, None]
-
-
-def _apart(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Distances of places (..., 2) [m]; 0 to nothing, which is NaN."""
-    return np.nan_to_num(np.hypot(*np.moveaxis(one - two, -1, 0)))
+    return place[None, :2]

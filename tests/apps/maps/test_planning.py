@@ -10,8 +10,9 @@ from towns import town_model
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance
 from gsparc.apps.maps.intervals import Evidence
-from gsparc.apps.maps.planning import Tour, plan_next
+from gsparc.apps.maps.planning import plan_next
 from gsparc.apps.maps.promise import Promise
+from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 
 
@@ -51,7 +52,7 @@ def test_corridors_and_a_length(tmp_path, predictor):
     lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
     (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
     found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5])
-    assert found.walk and not plan_next(predictor, 2).walk
+    assert len(found.path) and not len(plan_next(predictor, 2).path)
     on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
     assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
     short = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
@@ -85,11 +86,25 @@ def test_a_long_walk_for_nothing_was_not_called_so(predictor):
 
 def test_a_walk_is_not_longer_than_it_must_be():
     rng = np.random.default_rng(0)
-    places = np.column_stack([rng.permutation(12), np.zeros(12), np.zeros(12)])
-    tour = Tour(np.zeros(2), None)
-    for place in places:
+    at = rng.permutation(12)[:, None]
+    tour = Tour(np.abs(at - at.T) * 1.0, int(np.argmin(at)), None)
+    for place in rng.permutation(np.flatnonzero(at)):
         tour.add(place)
-    assert Tour.length_of(places[tour.number], np.zeros(2)) == pytest.approx(11)
+    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.stops) == sorted(np.flatnonzero(at))
+
+
+def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
+    shapely = pytest.importorskip("shapely", reason="shapely is not installed: pip install 'gsparc[maps]'")
+    grid = [[[0, 0], [100, 0]], [[50, -50], [50, 50]], [[0, 40], [100, 40]], [[200, 0], [300, 0]]]
+    streets = Streets.of([shapely.LineString(line) for line in grid], 10)
+    ways = Ways.between(np.array([[0.0, 0], [10, 40], [200, 0], [-5, 0]]), streets)
+    # By the crossing at (50, 0) and that at (50, 40), though no corner of a line is there.
+    assert ways.length[0, 1] == pytest.approx(50 + 40 + 40)
+    assert ways.length[3, 1] == pytest.approx(5 + 130)  # from beside the street
+    assert ways.length[0, 2] == pytest.approx(200) and not ways.along[0, 2]  # streets that do not meet
+    path = ways.through(np.array([0, 1]))
+    assert [50, 0] in path.tolist() and [50, 40] in path.tolist()
+    assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(130)
 
 
 @pytest.mark.parametrize("how, said", [
