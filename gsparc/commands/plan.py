@@ -37,7 +37,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     # Rows are in the order of the walk; the rank is that of their gains.
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
     walk = len(plan.path) > 0
-    columns |= {"walked_m": plan.metres.round(1)} if walk else {}
+    columns |= {"way_m": plan.metres.round(1)} if walk else {}
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     if walk:
         origin = None if predictor is None else predictor.site.georeference

@@ -204,16 +204,12 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
     # Real and imaginary part count as two numbers.
     each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
     if each > limits.numbers:
-        raise SettingError(
-            f"numbers={limits.numbers}: an answer at one place holds {each}; say {each} or more"
-        )
+        raise SettingError(f"numbers={limits.numbers}: one place's answer holds {each}; say {each} or more")
     # Both limits hold: of places, and of numbers in the answer.
     most = min(limits.most, limits.numbers // each)
     # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
     routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
-    batchers = {
-        route: Batcher(predictor, what, limits.delay_ms / 1e3, most) for route, what in routes.items()
-    }
+    batchers = {r: Batcher(predictor, what, limits.delay_ms / 1e3, most) for r, what in routes.items()}
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -234,9 +230,8 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
     async def pieces(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
         rows, loop = max(1, PIECE // each), asyncio.get_running_loop()
         for first in range(0, len(values), rows):
-            yield await loop.run_in_executor(
-                writer, _written, values, raw, predictor.unit, first, first + rows
-            )
+            part = values, raw, predictor.unit, first, first + rows
+            yield await loop.run_in_executor(writer, _written, *part)
 
     @app.post("/std")
     @app.post("/predict")
@@ -268,9 +263,8 @@ def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGI
         kind = RAW if raw else "application/json"
         about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
         if values.size <= PIECE:
-            return Response(
-                _written(values, raw, predictor.unit, 0, len(values)), headers=about, media_type=kind
-            )
+            whole = _written(values, raw, predictor.unit, 0, len(values))
+            return Response(whole, headers=about, media_type=kind)
         return StreamingResponse(pieces(values, raw), headers=about, media_type=kind)
 
     return app if token is None else _guarded(app, f"Bearer {token}".encode())
@@ -282,9 +276,8 @@ def _guarded(app: ASGIApp, wanted: bytes) -> ASGIApp:
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
         given = dict(scope.get("headers", ())).get(b"authorization", b"")
         free = scope["type"] == "lifespan" or scope["path"] == "/healthz"
-        refused = JSONResponse(
-            {"detail": "Authorization: Bearer TOKEN is needed"}, 401, {"connection": "close"}
-        )
+        fault = {"detail": "Authorization: Bearer TOKEN is needed"}
+        refused = JSONResponse(fault, 401, {"connection": "close"})
         await (app if free or hmac.compare_digest(given, wanted) else refused)(scope, receive, send)
 
     return guard

@@ -116,17 +116,10 @@ class Adaptation:
             return table.gather(1, mcs[:, None])[:, 0].double().numpy()
 
         return Rates(
-            10 * math.log10(band.median_power / noise),
-            oracle.numpy(),
-            chosen.numpy(),
-            of(delivered, oracle),
-            of(delivered, chosen),
-            delivered.max(1).values.numpy(),
-            of(fails.clamp_max(1), chosen),
-            regret.numpy(),
-            of(fails, oracle) > OUTAGE,
-            care,
-        )
+            10 * math.log10(band.median_power / noise), oracle.numpy(), chosen.numpy(),
+            of(delivered, oracle), of(delivered, chosen), delivered.max(1).values.numpy(),
+            of(fails.clamp_max(1), chosen), regret.numpy(), of(fails, oracle) > OUTAGE, care,
+        )  # fmt: skip
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""

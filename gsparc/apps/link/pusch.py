@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -56,10 +57,8 @@ class Pusch:
             estimators["predicted_pilots"] = _Wiener(self.grid, correlation, lambda: self._prior)
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
-        self.receivers = {
-            name: nr.PUSCHReceiver(self.transmitter, channel_estimator=estimator, **how)
-            for name, estimator in estimators.items()
-        }
+        made = partial(nr.PUSCHReceiver, self.transmitter, **how)
+        self.receivers = {name: made(channel_estimator=one) for name, one in estimators.items()}
 
     @property
     def pilot_share(self) -> float:
@@ -135,9 +134,8 @@ class _Wiener:
         mean, variance = (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if prior is None else prior
         variance = variance.double().clamp_min(LEAST_VARIANCE)[:, None]
         # In units of the prior variance: R_c (R_cc + N / v)^-1, a matrix for each position with its own.
-        known = self.whole[self.comb][:, self.comb] + torch.diag_embed(
-            (noise / variance).to(self.whole.dtype)
-        )
+        doubt = torch.diag_embed((noise / variance).to(self.whole.dtype))
+        known = self.whole[self.comb][:, self.comb] + doubt
         cross = self.whole[:, self.comb]
         filtering = torch.linalg.solve(known.mT, cross.T.expand(len(known), -1, -1)).mT
         news = (matched - mean[:, self.comb]).to(filtering.dtype)

@@ -10,18 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gsparc.apps.link import study
 from gsparc.apps.link.adaptation import Rates
 from gsparc.apps.link.channels import channels, on_band
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
-from gsparc.apps.link.study import (
-    acceptance,
-    adapt,
-    beam_facts,
-    curves,
-    pusch_facts,
-    rate_facts,
-    transmit,
-)
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.prediction.risk import Guarantee, accept
@@ -90,7 +82,7 @@ class LinkStudy:
         every = channels(self.method, self.data, self.fold.test, self.tones)
         # `test` are numbers into the fold's test rows, as `accepted` are into `test`.
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
-        return beam_facts(every.true, every.predicted, accepted)
+        return study.beam_facts(every.true, every.predicted, accepted)
 
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Rate adaptation at every noise level and its facts."""
@@ -98,8 +90,8 @@ class LinkStudy:
             channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = adapt(own, other, self.mcs)
-        return rates, rate_facts(rates, self.accepted)
+        rates = study.adapt(own, other, self.mcs)
+        return rates, study.rate_facts(rates, self.accepted)
 
     def send(
         self, modulation: str, levels: list[float]
@@ -113,9 +105,9 @@ class LinkStudy:
         how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.states_variance
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
-        blocks = transmit(pusch, self.grid.band(), levels, sizes)
-        rates, surest = curves(blocks, self.accepted), acceptance(blocks, self.score, SHARES)
-        facts = pusch_facts(modulation, rates)
+        blocks = study.transmit(pusch, self.grid.band(), levels, sizes)
+        rates, surest = study.curves(blocks, self.accepted), study.acceptance(blocks, self.score, SHARES)
+        facts = study.pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
             facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}

@@ -93,9 +93,7 @@ def adapt(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
     Raises:
         ValueError: every position is silent.
     """
-    loop = Adaptation(
-        float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
-    )
+    loop = Adaptation(*(settings[name] for name in ("bler_target", "subcarriers", "symbols_per_s")))
     # Noise by the median of positions with power, so that outages do not lower it.
     median = band.median_power
     if median <= 0:
@@ -196,10 +194,8 @@ def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame
         "bler": ("failed", "mean"), "ber": ("wrong", "mean"), "errors": ("failed", "sum"),
         "blocks": ("failed", "size"),
     }  # fmt: skip
-    return {
-        name: part.groupby("ebno_db").agg(**columns).reindex(levels).fillna(counts)
-        for name, part in parts.items()
-    }
+    means = {name: part.groupby("ebno_db").agg(**columns) for name, part in parts.items()}
+    return {name: mean.reindex(levels).fillna(counts) for name, mean in means.items()}
 
 
 def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
@@ -229,9 +225,6 @@ def acceptance(
     perfect = blocks[blocks.receiver == "perfect"].groupby("ebno_db", sort=False).failed.mean()
     level = float(np.log(perfect.clip(1e-3) / 0.1).abs().idxmin())
     there = blocks[blocks.ebno_db == level]
-    rates = {share: _surest(there, score, share).groupby("receiver").failed.mean() for share in shares}
+    sure, least = score[there.position], {share: np.quantile(score, 1 - share) for share in shares}
+    rates = {share: there[sure >= least[share]].groupby("receiver").failed.mean() for share in shares}
     return level, pd.DataFrame(rates).T
-
-
-def _surest(blocks: pd.DataFrame, score: np.ndarray, share: float) -> pd.DataFrame:
-    return blocks[score[blocks.position] >= np.quantile(score, 1 - share)]

@@ -40,17 +40,14 @@ def calibrated(snapshots: Sequence[Looked], places: np.ndarray, share: float, st
         return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
-        trust = of(point)
-        return -float(
-            np.mean([one.by(trust).at(place) for one, place in zip(snapshots, places, strict=True)])
-        )
+        trust, pairs = of(point), zip(snapshots, places, strict=True)
+        return -float(np.mean([one.by(trust).at(place) for one, place in pairs]))
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
-    optimum = minimize(
-        surprise, first, method="Nelder-Mead", options={"maxfev": LOOKS, "initial_simplex": simplex}
-    )
+    how = {"maxfev": LOOKS, "initial_simplex": simplex}
+    optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
     return levelled(of(optimum.x), snapshots, places, share)
 
 

@@ -76,9 +76,8 @@ def cover(
     count = np.where(live, np.maximum(np.ceil(extent / step), 1), 1).astype(int)
     edge = np.where(live, extent / count, 0.0)
     middle = np.median(trained, axis=0)
-    sides = [
-        low[i] + edge[i] * (np.arange(count[i]) + 0.5) if live[i] else middle[i : i + 1] for i in range(3)
-    ]
+    laid = [low[i] + edge[i] * (np.arange(count[i]) + 0.5) for i in range(3)]
+    sides = [laid[i] if live[i] else middle[i : i + 1] for i in range(3)]
     centre = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
     if around:
         tree = cKDTree(np.unique(trained, axis=0))

@@ -21,6 +21,7 @@ from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import located_by
 from gsparc.apps.locate.search import Unknown
+from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Snapshots, snapshots
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpreted
@@ -141,7 +142,8 @@ def by_model(
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
     cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
-    locator, count = Locator.of(run.predictor, data.moving[learned], unknown, start, cells, share), 0
+    field, count = SiteField(run.predictor), 0
+    locator = Locator(field, cells(data.moving[learned][:, :3]), unknown, start, share)
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
@@ -156,15 +158,12 @@ def by_model(
     pairs = zip(located, heard.place, strict=True)
     inside = np.array([one.posterior.level(at) <= level for one, at in pairs]) if placed else None
     places = np.array([one.place for one in located])
-    about: dict[str, list[Any]] = {
-        "area_m2": [one.area for one in located],
-        "modes": [one.modes for one in located],
-    }
+    about: dict[str, list[Any]]
+    about = {"area_m2": [one.area for one in located], "modes": [one.modes for one in located]}
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count}
-    return Localisation(
-        method.name, places, heard, trained, origin, placed, about, inside, each_ms, promise, facts
-    )
+    known = method.name, places, heard, trained, origin, placed, about
+    return Localisation(*known, inside, each_ms, promise, facts)
 
 
 def _trust(
@@ -224,9 +223,7 @@ def draw_posteriors(
         cells, density = one.posterior.cells, one.posterior.log_density
         order = np.argsort(density)  # cells above one another: the likeliest is seen
         corners = cells.centre[order, :2] - cells.edge[order, :2] / 2
-        boxes = [
-            Rectangle((x, y), w, h) for (x, y), (w, h) in zip(corners, cells.edge[order, :2], strict=True)
-        ]
+        boxes = [Rectangle(*box) for box in zip(corners, *cells.edge[order, :2].T, strict=True)]
         patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
         # 12 below the largest, a factor of 160,000: what is fainter is no different from white.
         patches.set_array(np.maximum(density[order], density.max() - 12))

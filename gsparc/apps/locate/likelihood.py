@@ -34,10 +34,8 @@ class Misfit:
 
     def __add__(self, other: Misfit) -> Misfit:
         """At the places of both, of the same snapshots."""
-        squared, size, silent = (
-            torch.cat([getattr(self, name), getattr(other, name)], 1)
-            for name in ("squared", "size", "silent")
-        )
+        pairs = (self.squared, other.squared), (self.size, other.size), (self.silent, other.silent)
+        squared, size, silent = (torch.cat(pair, 1) for pair in pairs)
         return Misfit(squared, size, self.count, silent)
 
     def at(self, places: Tensor) -> Misfit:

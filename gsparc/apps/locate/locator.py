@@ -76,18 +76,6 @@ class Locator:
     trust: Trust
     share: float = 0.9
 
-    @classmethod
-    def of(
-        cls, predictor: Predictor, trained: np.ndarray, unknown: Unknown, trust: Trust,
-        cells: Callable[[np.ndarray], Cells], share: float,
-    ) -> Self:  # fmt: skip
-        """Return the locator of a model that was trained at places (n, 3) [m, local], `cells` by these.
-
-        Raises:
-            ValueError: both ends move, or the model states no variance.
-        """
-        return cls(SiteField(predictor), cells(trained[:, :3]), unknown, trust, share)
-
     @cached_property
     def _coarse(self) -> Moments:
         """Computed once: most of the time of the first snapshot."""
@@ -129,28 +117,25 @@ def trusted(
     """Return how far such a method is trusted, from training places that it left out, and their number.
 
     The method is trained again without each of a few groups (`folds`) of its training rows, cut as the test
-    rows were; `locator` is that of the whole method, `cells` as of `Locator.of`.
+    rows were; `locator` is that of the whole method, `cells` lays its
+    cells by trained places (n, 3) [m, local].
     """
-    groups: list[tuple[Locator, Snapshots]] = []
+    pairs: list[tuple[Locator, Snapshots]] = []
     data, seed = learned.data, learned.context.seed
     rng = np.random.default_rng(seed)
     inner_folds = learned.cut(folds, seed).folds
     for number, inner in enumerate(inner_folds):
         log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
         method = learned.refit(inner, learned.context.within(f"group{number}"))
-        predictor, trained = Predictor(method, data.site), data.moving[np.union1d(inner.train, inner.val)]
-        without = Locator.of(predictor, trained, locator.unknown, locator.trust, cells, locator.share)
+        field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
+        without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
         heard = snapshots(data, inner.test)
         sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        groups.append((without, heard.at(sample)))
-    places = np.concatenate([heard.place for _, heard in groups])
+        pairs += [(without, heard.at(np.array([row]))) for row in sample]
+    places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Looked]:
-        return [
-            without.look(heard.at(np.array([row])), trust)
-            for without, heard in groups
-            for row in range(len(heard))
-        ]
+        return [without.look(heard, trust) for without, heard in pairs]
 
     trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.

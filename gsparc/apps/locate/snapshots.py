@@ -88,11 +88,8 @@ def of_values(
     heard = torch.as_tensor(values)
     count, each = site.stations and len(site.stations), {"spectrum": 3, "csi": 3, "rssi": 2}[site.kind]
     ndim = each if count is None or site.kind == "rssi" else each + 1
-    if (
-        heard.is_complex() != (site.kind == "csi")
-        or heard.ndim != ndim
-        or (count and heard.shape[1] != count)
-    ):
+    shaped = heard.ndim == ndim and (not count or heard.shape[1] == count)
+    if heard.is_complex() != (site.kind == "csi") or not shaped:
         stations = "" if count is None else f" of {count} stations"
         raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
     if silent is not None and (site.kind != "rssi" or np.shape(silent) != tuple(heard.shape)):

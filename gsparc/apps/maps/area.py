@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,7 +120,7 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
         low, high = _rectangle(area)
         if (high - low).max() < LEAST * width:
             fault = f"{(high - low).max():.2g} m wide, the site {width:.3g} m; a rectangle is in metres"
-            raise DataError(f"area={_as_text(area)}: {fault}, polygons of a *.geojson may be in degrees")
+            raise DataError(f"area={area}: {fault}, polygons of a *.geojson may be in degrees")
         return low, high, None
     if plan is not None:
         corners = plan.corners()
@@ -136,17 +135,13 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
 def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:
     corners = finite(area)
     if corners.shape != (4,):
-        raise DataError(f"area={_as_text(area)}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
+        raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
     if np.abs(corners).max() > FARTHEST:
-        raise DataError(f"area={_as_text(area)}: {np.abs(corners).max():.3g} is no coordinate in metres")
+        raise DataError(f"area={area}: {np.abs(corners).max():.3g} is no coordinate in metres")
     low, high = corners[:2], corners[2:]
     if not (high > low).all():
-        raise DataError(f"area={_as_text(area)}: is empty; x1 must be above x0 and y1 above y0")
+        raise DataError(f"area={area}: is empty; x1 must be above x0 and y1 above y0")
     return low, high
-
-
-def _as_text(area: Any) -> str:
-    return str(list(area)) if isinstance(area, Sequence) and not isinstance(area, str) else str(area)
 
 
 def _height(site: Site | None, height_m: float | None) -> float:

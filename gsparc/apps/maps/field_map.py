@@ -273,9 +273,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
 
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
-        bands |= {
-            f"power_db {name}": power for name, power in zip(raster.stations, raster.power_db, strict=True)
-        }
+        bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
     left, _, _, high = raster.grid.extent
     here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
     place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"

@@ -94,9 +94,7 @@ def _checked(points: Any, path: str | Path) -> np.ndarray:
     if pairs.shape != (2, 4):
         raise DataError(f"plan_points={points}: two points of four numbers are needed; {SHOW}")
     if np.hypot(*(pairs[1, :2] - pairs[0, :2])) < LEAST_PIXELS:
-        raise DataError(
-            f"plan={path}: its two points are one pixel, which tells no scale; take two far apart"
-        )
+        raise DataError(f"plan={path}: plan_points are one pixel, which gives no scale; take two far apart")
     if not 0 < np.hypot(*(pairs[1, 2:] - pairs[0, 2:])) < FARTHEST or np.abs(pairs[:, 2:]).max() > FARTHEST:
         raise DataError(f"plan={path}: its two points are one place, or not in metres; take two far apart")
     return pairs

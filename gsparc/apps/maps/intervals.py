@@ -118,9 +118,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     used = evidence.at(np.flatnonzero(np.isfinite(evidence.error)))
     heard = used.side == 0
     if heard.sum() < LEAST_ROWS:
-        raise ValueError(
-            f"{heard.sum()} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"
-        )
+        fault = f"{heard.sum()} of them were held out, {LEAST_ROWS} at least are needed"
+        raise ValueError(f"too few rows to test intervals ({fault}); promised=false draws without a promise")
     blocks = len(np.unique(used.block))
     level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
     station = _of_stations(used, level)
@@ -215,9 +214,8 @@ def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, n
 def _inside(calibration: Calibration, evidence: Evidence, half: np.ndarray) -> np.ndarray:
     side, mean = evidence.side, evidence.mean_db
     expected = calibration.expected_error(evidence.spread_db, evidence.distance, evidence.station)
-    low, high, bound = (
-        calibration.below(level, mean, expected) for level in (mean - half, mean + half, evidence.level_db)
-    )
+    levels = mean - half, mean + half, evidence.level_db
+    low, high, bound = (calibration.below(level, mean, expected) for level in levels)
     allowed = np.where(side > 0, bound, 1 - bound)
     both = np.where(side > 0, np.minimum(high, bound) - low, high - np.maximum(low, bound))
     chance = np.clip(np.divide(both, allowed, out=np.zeros_like(both), where=allowed > 0), 0.0, 1.0)

@@ -84,7 +84,7 @@ def map_of(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = own_deviations(share) if promise is None else promise.calibration(share)
-    values = empty(len(names), grid.shape)
+    values: dict[str, Any] = empty(len(names), grid.shape)
     stride = _stride(grid, promise, tolerance_db)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     every, computed = np.flatnonzero(grid.inside), 0
@@ -100,11 +100,10 @@ def map_of(
         alike[chosen] = parts[2] if joint else 0.0
         computed += count * size
     if computed < len(names) * len(every):
-        notes.append(
-            f"{computed} of {len(names) * len(every)} predictions were made, the others interpolated "
-            f"within about {tolerance_db:g} dB"
-        )
-    bands = bands_of(site, numbers)
+        most = f"{computed} of {len(names) * len(every)} levels were predicted"
+        notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
+    about = station_facts(site, numbers)
+    bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     usual, floor = _usual(promise, numbers, noise_db)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
@@ -135,17 +134,14 @@ def map_of(
             flat[name][..., cells] = layer
         overlap[cells] = overlapping(power, carrier)
     if promise is not None and not np.isfinite(values["power_db"]).any():
-        raise DataError(
-            f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
-            "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
-        )
+        fault = f"every cell lies more than {calibration.reach:.3g} m from what was measured"
+        raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
     extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.shape)}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
-        grid, tuple(names), **values, share=share, calibrated=promise is not None,
-        threshold_db=threshold_db, extra=extra, bands=bands,
-        places=np.unique(known, axis=0), station_place=_still(site, names), notes=tuple(notes),
-        azimuth=azimuths_of(site, numbers), unit=site.level_unit, site=_sites(site, numbers),
+        grid, **values, share=share, calibrated=promise is not None,
+        threshold_db=threshold_db, extra=extra, places=np.unique(known, axis=0), notes=tuple(notes),
+        unit=site.level_unit, **about,
     ).raised(level.raised_db, level.name)  # fmt: skip
 
 
@@ -170,9 +166,7 @@ def answering(
     stations = predictor.site.stations
     if stations is None:
         if wanted is not None:
-            raise DataError(
-                f"{key}={list(wanted)}: the model of {predictor.site.name} has no stations; leave it out"
-            )
+            raise DataError(f"{key}={list(wanted)}: {predictor.site.name} has one station; leave it out")
         return [""], []
     names: list[str] = []
     for one in wanted if wanted is not None else stations.name:
@@ -321,30 +315,19 @@ def _usual(
     return usual, floor
 
 
-def bands_of(site: Site, numbers: np.ndarray) -> tuple[str, ...]:
-    """Carriers of stations (T,); () where all have one."""
-    carrier = None if site.stations is None else site.stations.carrier_hz
-    if carrier is None or len(np.unique(carrier[numbers])) == 1:
-        return ()
-    return tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier[numbers])
-
-
-def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
-    """Directions (T,) that sectors face [deg from north], NaN of what is none."""
-    sector = None if site.stations is None else site.stations.sector
-    return np.full(len(numbers), np.nan) if sector is None else sector[numbers, 0]
-
-
-def _sites(site: Site, numbers: np.ndarray) -> np.ndarray:
-    """Numbers (T,) of the sites that stations belong to."""
-    stations = site.stations
-    return np.zeros(1, np.int64) if stations is None else sites_of(stations, stations.position)[numbers]
-
-
-def _still(site: Site, names: Sequence[str]) -> np.ndarray:
-    """World places (T, 2) of the stations [m], NaN where unknown."""
-    if site.stations is not None:
-        rows = [site.stations.name.index(name) for name in names]
-        return site.stations.position[rows][:, :2] + site.origin[:2]
-    place = np.full(3, np.nan) if site.static_position is None else site.static_position
-    return (place + site.origin)[None, :2]
+def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
+    """Return what a `FieldMap` says of stations (T,): names, as in a list of cells, places, carriers, ..."""
+    stations, nothing = site.stations, np.full(3, np.nan)
+    if stations is None:
+        still = (nothing if site.static_position is None else site.static_position) + site.origin
+        return {"stations": ("",), "station_place": still[None, :2], "bands": ()}
+    carrier = np.zeros(1) if stations.carrier_hz is None else stations.carrier_hz[numbers]
+    several = len(np.unique(carrier)) > 1
+    called = getattr(stations, "label", None) or stations.name
+    return {
+        "stations": tuple(called[number] for number in numbers),
+        "station_place": stations.position[numbers, :2] + site.origin[:2],
+        "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
+        "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),
+        "site": sites_of(stations, stations.position)[numbers],
+    }

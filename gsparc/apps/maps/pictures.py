@@ -20,17 +20,8 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.placing import Placing
 from gsparc.apps.maps.planning import Plan
 from gsparc.apps.maps.promise import Promise
+from gsparc.evaluation import from_above
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import (
-    OUTLINE,
-    annotate,
-    bounded,
-    draw_measured,
-    draw_sectors,
-    draw_stations,
-    legend_below,
-    scale_bar,
-)
 from gsparc.prediction.predictor import Predictor
 
 MOST_OVERLAP = 5.0  # stations that the colours end with
@@ -66,10 +57,6 @@ class Legend:
         # One and 99 %: a cell at a mast would leave one colour for the rest.
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
         return cls(label, float(low), float(high if high > low else low + 1.0), colours)
-
-    def strip(self) -> np.ndarray:
-        """Colours (16, 3) uint8 from low to high."""
-        return self.of(np.linspace(self.low, self.high, 16))
 
 
 @dataclass(frozen=True)
@@ -219,12 +206,12 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
-    bounded(axis, (left, low), (right, high), title=title)
+    from_above.bounded(axis, (left, low), (right, high), title=title)
     draw_places(axis, field)
-    scale_bar(axis)
+    from_above.scale_bar(axis)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
-    legend_below(figure)
+    from_above.legend_below(figure)
     save(figure, path, 110)
 
 
@@ -232,7 +219,7 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     """Names on their areas; those of the largest also in the legend."""
     for row, column, word in named_areas(layer.values, layer.words):
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
-                  path_effects=OUTLINE)  # fmt: skip
+                  path_effects=from_above.OUTLINE)  # fmt: skip
     listed = layer.listed()
     for colour, word in [*zip(listed["colour"], listed["station"], strict=True)][:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
@@ -269,17 +256,17 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
 def draw_places(axis: Any, field: FieldMap) -> None:
     """Measured points and stations; those outside the map are left out."""
     left, right, low, high = field.grid.extent
-    draw_measured(axis, field.places)
+    from_above.draw_measured(axis, field.places)
     known = field.station_place
     inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
     faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(known), bool)
     if (inside & ~faces).any():
-        draw_stations(axis, known[inside & ~faces])
+        from_above.draw_stations(axis, known[inside & ~faces])
     if (inside & faces).any():
-        draw_sectors(axis, known[inside & faces], field.azimuth[inside & faces])
+        from_above.draw_sectors(axis, known[inside & faces], field.azimuth[inside & faces])
     if 1 < len(known) <= NAMED and not faces.any():
         for where, name in zip(known[inside], np.array(field.stations)[inside], strict=True):
-            annotate(axis, name, where)
+            from_above.annotate(axis, name, where)
 
 
 def draw_plan_picture(
@@ -295,20 +282,21 @@ def draw_plan_picture(
     errors = np.concatenate([batch.error_before, batch.error_after])
     # 99.5 %: a single corner far from all rows would flatten the rest.
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
-    for axis, values, title in ((before, batch.error_before, "before"), (after, batch.error_after, "after")):
+    done = f"after these {len(batch.places)}"
+    for axis, values, title in ((before, batch.error_before, "now"), (after, batch.error_after, done)):
         image = np.full(batch.grid.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
-        bounded(axis, (left, low), (right, high), ylabel="", title=title)
-        scale_bar(axis)
+        from_above.bounded(axis, (left, low), (right, high), ylabel="", title=title)
+        from_above.scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
-        draw_measured(before, places)
+        from_above.draw_measured(before, places)
     after.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
     after.plot(*batch.places[:, :2].T, "o", color="red", markeredgecolor="white", markersize=6, zorder=3)
     for number, place in enumerate(batch.places[:60], 1):
         after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
-                       path_effects=OUTLINE, zorder=4)  # fmt: skip
+                       path_effects=from_above.OUTLINE, zorder=4)  # fmt: skip
     figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
     curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
@@ -324,9 +312,9 @@ def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = 
     dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
     label = f"share of the area with {threshold_db:g} {unit} or more, with a station here"
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
-    draw_stations(axis, placing.stations)
-    draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
-    bounded(axis, (left, low), (right, high))
-    scale_bar(axis)
-    legend_below(figure)
+    from_above.draw_stations(axis, placing.stations)
+    from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
+    from_above.bounded(axis, (left, low), (right, high))
+    from_above.scale_bar(axis)
+    from_above.legend_below(figure)
     save(figure, path, 100)

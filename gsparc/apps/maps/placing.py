@@ -19,6 +19,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.limits import Checked, check_arguments, finite, number, setting, whole
 from gsparc.data.query_places import read_query_places
+from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.data.tables import is_table
 from gsparc.prediction.placing import in_world
@@ -233,9 +234,15 @@ def _new(
     return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 
+def assumption(site: Site, height: float, antenna: Antenna) -> str:
+    """Return in words what a new station is taken to be, `height` [m] high."""
+    carrier = None if site.stations is None else site.stations.carrier_hz
+    # The first band is the lowest: see `gsparc.processes.sectors.Sectors.joined_by`.
+    band = "" if carrier is None or np.ptp(carrier) == 0 else f" in the band of {carrier.min() / 1e6:g} MHz"
+    return f"assumed: {height:.4g} m high{band}, {antenna} (see station_height_m, antenna)"
+
+
 def unheard_stations_error(what: str) -> DataError:
     """Return the error for models that know no station but those they learned from."""
-    return DataError(
-        f"{what}: answers only for the stations that it heard; train with stations=together, for example "
-        "model=gp or distance_law"
-    )
+    advice = "train with stations=together, for example model=gp or distance_law"
+    return DataError(f"{what}: answers only for the stations that it heard; {advice}")

@@ -23,6 +23,7 @@ from gsparc.prediction.refit import Learned
 KEY = "map"
 CHUNK = 512  # rows predicted at a time
 SIDES = (1.0, 2.0)  # of blocks, by turns: near and far rows alike
+SHARE_OUT, ROWS_OUT = 0.2, 100  # of the rows, held out by each fit, and by all together at least
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class PromiseSettings(Checked):
 
     Attributes:
         share: of measurements that intervals hold.
-        folds: fits, each without other blocks.
+        folds: fits, each without other blocks; more of few rows, until `ROWS_OUT` are held out.
         rows: of each fold that are asked about, at most, drawn evenly.
         block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer side.
         budget_s: seconds of each refit; None: as the model was trained.
@@ -111,7 +112,8 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
 
     def evidence_without(number: int) -> Evidence:
         # Every second fold with sides twice as long, for evidence at larger distances.
-        split = SplitSettings("blocks", side_m=side * SIDES[number % len(SIDES)], val_fraction=0.1)
+        wide = side * SIDES[number % len(SIDES)]
+        split = SplitSettings("blocks", side_m=wide, share=SHARE_OUT, val_fraction=0.1)
         cut = learned.cut(1, settings.seed + number // len(SIDES), split)
         inner = learned.answerable(cut.folds[0])
         less = learned.without(inner, split)
@@ -121,9 +123,10 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
         unit = cut.unit[tried] + number * (len(data) + 1)
         return evidence_of(less, data, replace(inner, test=tried), unit)
 
-    by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
+    by_number = dict(each(evidence_without, folds, "fits without blocks of places"))
     # In the order of folds, whichever ended first: evidence must not depend on it.
-    parts = [by_number[number] for number in range(settings.folds)]
+    parts = [by_number[number] for number in folds]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_of(data, learned.rows), side)
 

@@ -70,22 +70,19 @@ def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
     figures = field.figures()
     share = figures["map/server_unsure"]
     if share and len(field.stations) > 1:
-        notes.append(
-            f"best_server: in {share:.1%} of the cells (hatched) the station named is less likely than not "
-            "the strongest and above its floor (noise_db=, or what its receiver hears)"
-        )
+        notes.append(f"best_server: in {share:.1%} of the cells (hatched) it is more likely another, or none")
+    if field.unit == "dB":
+        notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
         own = "intervals are the model's own deviations, and places far from data are not refused"
         return [*notes, f"no promise: {own}"]
-    silent = f", of those below one, which nobody can see, {coverage.silent_share:.1%} by its own belief"
-    apart = f", {coverage.heard_share:.1%} of those with a level{silent}"
+    silent = f"of those not heard, as the model estimates, {coverage.silent_share:.1%}"
+    apart = f" (of heard rows {coverage.heard_share:.1%}, {silent})"
     apart = "" if np.isnan(coverage.silent_share) else apart
-    ours = f"{coverage.share:.1%} did{apart} (mean width {coverage.width_db:.1f} dB"
-    own = f"the model's own deviations: {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB)"
-    notes.append(
-        f"in {field.share:.0%} of the cells a measurement is promised to lie in its interval: of "
-        f"{coverage.rows} rows in {coverage.blocks} held-out blocks {ours}; {own}"
-    )
+    ours = f"{coverage.share:.1%} of them held{apart}, {coverage.width_db:.1f} dB wide in the mean"
+    own = f"uncalibrated {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB"
+    tested = f"tested on {coverage.rows} rows of {coverage.blocks} held-out blocks"
+    notes.append(f"{field.share:.0%} intervals, {tested}: {ours}; {own}")
     if figures["map/refused"]:
         cells = f"{figures['map/refused']} of {int(field.grid.inside.sum())} cells"
         notes.append(f"{cells} are refused: too far from what was measured")

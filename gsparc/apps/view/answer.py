@@ -107,9 +107,8 @@ def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> 
         first = left[0]
         alike = left == first
         if towards is not None:
-            alike |= (np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS) & (
-                towards[left] @ towards[first] > SAME_COSINE
-            )
+            near = np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS
+            alike |= near & (towards[left] @ towards[first] > SAME_COSINE)
         firsts.append(first)
         power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
         left = left[~alike]

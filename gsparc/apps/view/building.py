@@ -50,7 +50,8 @@ def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured:
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
-    ground = ground_of(viewed)
+    low = viewed.box()[0, 2]  # of measured places, and of planes where there are any
+    ground = float(min(low, viewed.heights()[0]) if viewed.site.kind in MAPPED else low)
     if plan is not None:
         corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
@@ -80,11 +81,6 @@ def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured:
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
     return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
-
-
-def ground_of(viewed: Viewed) -> float:
-    """Height beneath which nothing is shown [m]: of measured places and planes."""
-    return min(float(viewed.box()[0, 2]), viewed.heights()[0] if viewed.site.kind in MAPPED else np.inf)
 
 
 def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
@@ -159,9 +155,8 @@ class Sphere:
         assert site.grid is not None
         directions = site.grid.directions().numpy()
         every = max(1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS))))
-        row, column = (
-            a.reshape(-1) for a in np.mgrid[0 : directions.shape[0] : every, 0 : directions.shape[1] : every]
-        )
+        high, wide = directions.shape[:2]
+        row, column = (a.reshape(-1) for a in np.mgrid[0:high:every, 0:wide:every])
         turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
         radius = RADIUS * extent
         offsets = radius * directions[row, column] @ turn.T

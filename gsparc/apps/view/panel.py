@@ -24,14 +24,6 @@ def response_db(response: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 
-def tones_mhz(site: Site, count: int) -> np.ndarray:
-    """Frequencies (count,) [MHz]; numbers of subcarriers where they are not known."""
-    known = site.subcarriers_hz
-    if known is None or len(known) != count:
-        return np.arange(count, dtype=np.float64)
-    return np.asarray(known, np.float64) / 1e6
-
-
 def panel_image(answer: Answer, site: Site) -> np.ndarray | None:
     """Draw a spectrum, or a channel over its band, its paths or its antennas, (h, w, 3) uint8.
 
@@ -49,10 +41,12 @@ def panel_image(answer: Answer, site: Site) -> np.ndarray | None:
         axis.grid(False)
         axis.set(xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction")
     elif response is not None and response.shape[1] > 1:
-        x = tones_mhz(site, response.shape[1])
+        tones, count = site.subcarriers_hz, response.shape[1]
+        known = tones is not None and len(tones) == count
+        x = np.asarray(tones, np.float64) / 1e6 if known else np.arange(count)
         for line in response_db(response):
             axis.plot(x, line)
-        axis.set(xlabel="frequency [MHz]", ylabel="dB", title="channel over the band")
+        axis.set(xlabel="frequency [MHz]" if known else "subcarrier", ylabel="dB", title="over the band")
     elif paths is not None and len(paths.gain_db):
         bottom = paths.gain_db.min() - 3
         axis.vlines(paths.delay_ns, bottom, paths.gain_db)

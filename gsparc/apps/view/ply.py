@@ -31,13 +31,6 @@ def write_ply(path: str | Path, cloud: GaussianCloud, colours: np.ndarray) -> No
     Raises:
         DataError: there are none, or one is not finite.
     """
-    content = ply_bytes(cloud, colours)
-    with whole_file(Path(path)) as partial:
-        partial.write_bytes(content)
-
-
-def ply_bytes(cloud: GaussianCloud, colours: np.ndarray) -> bytes:
-    """Return what `write_ply` writes."""
     share = np.clip(cloud.opacities, LEAST_SHARE, 1 - LEAST_SHARE)
     columns = np.column_stack(
         [
@@ -49,4 +42,5 @@ def ply_bytes(cloud: GaussianCloud, colours: np.ndarray) -> bytes:
         raise DataError("there are no Gaussians to write, or one is not finite")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
     header += [*(f"property float {name}" for name in FIELDS), "end_header", ""]
-    return "\n".join(header).encode() + columns.tobytes()
+    with whole_file(Path(path)) as partial:
+        partial.write_bytes("\n".join(header).encode() + columns.tobytes())

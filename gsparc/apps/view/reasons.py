@@ -84,7 +84,8 @@ def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str
         swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
         rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
     for legend in dict.fromkeys(legends):
-        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in legend.strip())
+        strip = legend.of(np.linspace(legend.low, legend.high, 16))
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in strip)
         rows.append(
             f'<div style="margin:.35em .7em;font-size:.8em">{html.escape(legend.label)}'
             f'<div style="height:.8em;background:linear-gradient(to right,{stops})"></div>'

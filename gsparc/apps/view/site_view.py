@@ -67,7 +67,7 @@ class SiteView:
     @property
     def unit(self) -> str:
         """Of powers."""
-        return self.viewed.unit
+        return self.viewed.site.level_unit
 
     def station(self, name: str | None) -> StationView:
         """Return the view of a station, made when first asked for, in seconds; those made wait for nobody."""

@@ -48,7 +48,6 @@ class Viewed:
         data: in the model's coordinates and units; None where they are gone.
         stations: that it answers for; one, None, where there is one static end or none.
         notes: what a reader must know, one line each.
-        unit: of powers.
     """
 
     name: str
@@ -56,7 +55,6 @@ class Viewed:
     data: Measurements | None
     stations: tuple[str | None, ...]
     notes: tuple[str, ...] = ()
-    unit: str = "dB"
 
     @property
     def site(self) -> Site:
@@ -114,7 +112,7 @@ class Viewed:
             # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
-            label = f"measured {what} [{self.unit}]"
+            label = f"measured {what} [{self.site.level_unit}]"
         return Measured(places, values, label)
 
 
@@ -152,4 +150,4 @@ def open_viewed(
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)
-    return Viewed(str(path), predictor, data, stations, tuple(notes), site.level_unit)
+    return Viewed(str(path), predictor, data, stations, tuple(notes))

@@ -148,9 +148,9 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
     rng = np.random.default_rng(0)
     rx, csi = rng.uniform(size=(20, 3)), rng.normal(size=20) + 1j
     waves = gsparc.fit(rx=rx, tx=[3.0, 2, 1], csi=csi, frequency_hz=2.4e9, model="complex_gp")
-    with pytest.raises(ValueError, match=r"^complex_gp: channels that are not made of image sources [^\n]*$"):
+    with pytest.raises(ValueError, match=r"^complex_gp: channels that are no sum of image sources [^\n]*$"):
         make.compiled(waves)
-    with pytest.raises(ValueError, match=r"^gp: of spectra only fields of Gaussians have a compiled form"):
+    with pytest.raises(ValueError, match=r"^gp: of spectra only rendered Gaussians can be compiled"):
         make.compiled(of_images("gp"))
 
 

@@ -270,7 +270,7 @@ def test_numbers_of_an_answer_are_limited_and_large_ones_come_in_pieces(spectra)
         np.testing.assert_allclose(found["values"], expected, rtol=1e-4, atol=1e-6)
         raw = np.frombuffer(served.post(places[:30].tobytes(), RAW)[1], "<f4")
         np.testing.assert_allclose(raw.reshape(30, 18, 36), expected, rtol=1e-4, atol=1e-6)
-    with pytest.raises(ValueError, match="numbers=600: an answer at one place holds 648"):
+    with pytest.raises(ValueError, match="numbers=600: one place's answer holds 648"):
         application(spectra, Limits(numbers=600), None)
 
 

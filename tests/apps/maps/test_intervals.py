@@ -80,7 +80,7 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
 
 
 def test_too_little_evidence_promises_nothing():
-    with pytest.raises(ValueError, match="too few for a promise"):
+    with pytest.raises(ValueError, match="too few rows to test intervals"):
         calibrate(evidence(LEAST_ROWS - 1))
 
 

@@ -18,6 +18,7 @@ from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import _usual, answering, levels_at, map_of
 from gsparc.apps.maps.pictures import Layer, Legend, layers, named_areas, shades
 from gsparc.apps.maps.promise import Promise
+from gsparc.apps.maps.promised import notes_of
 from gsparc.apps.maps.refining import refined
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
@@ -250,3 +251,11 @@ def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
     assert names == ["west"] and "east was never heard" in notes[0]
     with pytest.raises(DataError, match="never heard"):
         answering(predictor, ["east"], promise)
+
+
+def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(predictor, monkeypatch):
+    monkeypatch.setitem(vars(predictor.site.stations), "label", ("Roof 1", "Tower"))
+    found = map_of(predictor, step_m=8.0, stations=["east", "west"])
+    assert found.stations == ("Tower", "Roof 1")
+    # What was measured is in dB, of what nobody said: the map says how it is called dBm.
+    assert any("unit=dBm" in note for note in notes_of(found, None))

@@ -1,5 +1,6 @@
 """One more station goes where the others do not serve, by models that know stations they never heard."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from towns import MASTS, town_file, town_model
 
 import gsparc
-from gsparc.apps.maps.placing import Antenna, NewStation, new_station_error, place_next
+from gsparc.apps.maps.placing import Antenna, NewStation, assumption, new_station_error, place_next
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
@@ -68,3 +69,12 @@ def test_spoilt_wishes(together, said, how):
     with pytest.raises(DataError, match=said) as caught:
         place_next(gsparc.load(model), threshold_db=-75.0, **how)
     assert "\n" not in str(caught.value)
+
+
+def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
+    site = gsparc.load(together[2]).site
+    assert "band" not in assumption(site, 8.0, Antenna())
+    two = replace(site, stations=replace(site.stations, carrier_hz=np.array([2.6e9, 1.8e9])))
+    assert assumption(two, 8.0, Antenna([0, 120])).startswith(
+        "assumed: 8 m high in the band of 1800 MHz, sect"
+    )

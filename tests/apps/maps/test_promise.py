@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.promise import PromiseSettings, gather, predict_rows
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
@@ -53,3 +53,14 @@ def test_intervals_of_thirty_towns_hold_a_measurement_as_often_as_promised_and_t
         assert abs(measured[mask].mean() - SHARE) < 2 * error
         assert true[mask].mean() > SHARE - 2 * error
     assert true[noisy == 1].mean() > 0.96
+
+
+def test_a_map_of_sixty_rows_was_refused():
+    """Four folds held out 48 of them, and four fifths of these are fewer than intervals are tested on."""
+    data, _, _ = drawn(0)
+    every = np.arange(60)
+    fold, context = Fold(every, every[:0], every[:0]), FitContext()
+    method = GaussianProcess()
+    method.fit(data, fold, context)
+    promise = gather(Learned(method, GaussianProcess, data, fold, context), PromiseSettings())
+    assert len(promise.evidence) >= 100 and promise.coverage(SHARE).share > 0.8

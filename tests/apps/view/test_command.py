@@ -65,7 +65,7 @@ def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):
     monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
     given = compose("ckpt=x", config="view").unit
     viewed = open_viewed(town_model(), {"file": "gone.npz"}, "west", given)
-    assert viewed.unit == "dBm"
+    assert viewed.site.level_unit == "dBm"
 
 
 def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
@@ -73,7 +73,7 @@ def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
     read, places = checkpoint.read, np.array([[20.0, 30, 1.5], [50, 10, 1.5]])
     monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
     dbm, dbw = (open_viewed(town_model(), unit=unit) for unit in (None, "dBW"))
-    assert (dbm.unit, dbw.unit) == ("dBm", "dBW")
+    assert (dbm.site.level_unit, dbw.site.level_unit) == ("dBm", "dBW")
     level, lower = (levels_at(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
     np.testing.assert_allclose(lower, level - 30, atol=1e-4)
     np.testing.assert_allclose(dbw.measured("west").values, dbm.measured("west").values - 30, atol=1e-4)

@@ -149,9 +149,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
             alone._average = None
             return replace(own_form, predictor=Predictor(alone, site))
     if site.kind == "spectrum":
-        raise ValueError(
-            f"{method.name}: of spectra only fields of Gaussians have a compiled form (model=gsparc)"
-        )
+        raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
     sources = _sources_of(method) if site.kind == "csi" else None
     data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
     if sources is not None:
@@ -171,10 +169,8 @@ def _sources_of(method: Method) -> ImageSourceGP:
     for _, one in sorted(parts, key=lambda part: -part[0]):
         if isinstance(one, ImageSourceGP):
             return one
-    raise ValueError(
-        f"{method.name}: channels that are not made of image sources have no compiled form "
-        "(model=image_source_gp is made of them)"
-    )
+    fault = "channels that are no sum of image sources have no compiled form (model=image_source_gp has)"
+    raise ValueError(f"{method.name}: {fault}")
 
 
 def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:

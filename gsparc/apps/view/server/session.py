@@ -75,9 +75,8 @@ class Session:
                 position=self.scene.frame.drawn(place),
             )  # fmt: skip
             self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
-            self.client.scene.add_label(
-                f"/{end}/name", ENDS[end], position=(0, 0, 0.03 * EXTENT), anchor="bottom-center"
-            )
+            above: Any = {"position": (0, 0, 0.03 * EXTENT), "anchor": "bottom-center"}
+            self.client.scene.add_label(f"/{end}/name", ENDS[end], **above)
             gizmo.on_update(self._dragged(end))
             self.gizmos[end] = gizmo
 
@@ -270,10 +269,8 @@ class Session:
             if first:
                 self._legends()
             suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
-            self.progress.content = (
-                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}, "
-                f"{time.perf_counter() - begin:.1f} s"
-            )
+            said = f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}"
+            self.progress.content = f"{said}, {time.perf_counter() - begin:.1f} s"
             yield
 
     def _legends(self) -> None:
