@@ -71,6 +71,12 @@ class Jointly:
         >>> covariance, noise = predictor.covariance(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
         >>> covariance.shape, bool(covariance[0, 1] < covariance[0, 0]), noise > 0
         ((2, 2), True, True)
+
+        Samples of the field at these places together, for the risk of what is decided by it:
+
+        >>> level = predictor.rssi(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])[:, 0]
+        >>> np.random.default_rng(0).multivariate_normal(level, covariance, 100).shape
+        (100, 2)
         """
         places = self.queries.query(tx, rx, torch.float64).query.places(self.site)
         known = self.method.joint() if isinstance(self.method, OfStation) else None
