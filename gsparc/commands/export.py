@@ -11,9 +11,9 @@ from omegaconf import DictConfig
 
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
-from gsparc.apps.export.along.taps import Trajectory, write_impulses
-from gsparc.apps.export.compiled.blob import write
-from gsparc.apps.export.compiled.make import FIGURES, compiled
+from gsparc.apps.export.along.taps import Trajectory, write_taps
+from gsparc.apps.export.compiled.blob import write_form
+from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
@@ -49,9 +49,9 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
-    result = compiled(predictor, int(config.places))
+    result = compile_model(predictor, int(config.places))
     origin = np.asarray(predictor.site.origin)
-    size = write(folder / "field.gsparc", result.form, origin, result.error, result.worst)
+    size = write_form(folder / "field.gsparc", result.form, origin, result.error, result.worst)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
     facts: dict[str, Any] = {"export/bytes": size, "export/form": result.form.kind}
@@ -76,7 +76,7 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:
         raise SettingError(f"table={config.table}: no column time_s [s]")
-    facts = write_impulses(predictor, Trajectory(time_s, place), plain(config), folder / "taps.npz")
+    facts = write_taps(predictor, Trajectory(time_s, place), plain(config), folder / "taps.npz")
     taps, rate_hz = facts.pop("taps/count"), facts.pop("taps/rate_hz")
     line = (
         f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the channels "
@@ -88,7 +88,7 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
 
 def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
     place = _places(predictor, config)
-    paths, left = deepmimo.write(folder, predictor, place)
+    paths, left = deepmimo.write_scenario(folder, predictor, place)
     facts = {"deepmimo/places": len(place), "deepmimo/paths": paths, "deepmimo/left_out": left}
     return facts, [f"{len(place)} places, at most {paths} paths; beyond these {left:.2g} of the power: {out}"]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.apps.locate.fingerprints import by_fingerprints
-from gsparc.apps.locate.judging import by_model, report
+from gsparc.apps.locate.fingerprints import locate_fingerprints
+from gsparc.apps.locate.judging import locate_by_model, report
 from gsparc.apps.locate.neighbours import PLAIN
-from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
@@ -33,9 +33,9 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     for name in config.against:
         choice(*PLAIN).check("against", name)
     if config.dataset.name == "fingerprints":
-        localisation = by_fingerprints(config)
+        localisation = locate_fingerprints(config)
     else:
-        plan = plan_of(plain(config))
-        localisation = by_model(config, run_dir, None if plan is None else plan.light)
+        plan = read_plan_settings(plain(config))
+        localisation = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
     facts, tables, lines = report(localisation, config.against, run_dir)
     return finish(run_dir, facts, *tables, lines=lines)

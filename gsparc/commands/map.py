@@ -7,12 +7,12 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.maps.field_map import FieldMap, geotiff_wanted, write_geotiff
-from gsparc.apps.maps.floor_plan import plan_of
-from gsparc.apps.maps.making import map_of
-from gsparc.apps.maps.pictures import draw_layer, file_name, layers
+from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_geotiff
+from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.making import predict_map
+from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
-from gsparc.apps.maps.promised import notes_of, promise_of
+from gsparc.apps.maps.promised import map_notes, read_or_gather
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
@@ -50,7 +50,7 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
         DataError: `save` that no layer's file matches.
     """
     save = [] if config.save is None else [str(config.save)]
-    names = [file_name(layer, suffix) for layer in layers(field) for suffix in SUFFIXES]
+    names = [file_name(layer, suffix) for layer in list_layers(field) for suffix in SUFFIXES]
     if save and not any(fnmatch(name, save[0]) for name in names):
         said = ", ".join(name for name in names if name.endswith(".pdf"))
         raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {said}")
@@ -61,7 +61,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
     run_dir, settings = run_directory(), plain(config)
-    floor = plan_of(settings)
+    floor = read_plan_settings(settings)
     predictor = load(config.ckpt)
     how = PromiseSettings(**settings["promise"])
     query = {
@@ -71,25 +71,25 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
     }  # fmt: skip
     # Refuses what cannot be before any evidence is gathered.
-    first = map_of(predictor, dry=True, **query)
+    first = predict_map(predictor, dry=True, **query)
     wanted = _pictures(config, first)
     # Refused before evidence is gathered, which takes minutes.
-    geotiff_wanted(config.geotiff)
-    promise = promise_of(str(config.ckpt), settings)
-    field = map_of(predictor, promise=promise, **query)
+    check_geotiff(config.geotiff)
+    promise = read_or_gather(str(config.ckpt), settings)
+    field = predict_map(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
-    lines = notes_of(field, coverage)
+    lines = map_notes(field, coverage)
     size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in layers(field):
+    for layer in list_layers(field):
         for suffix in SUFFIXES:
             name = file_name(layer, suffix)
             if any(fnmatch(name, one) for one in wanted):
                 draw_layer(field, layer, run_dir / name, title, floor)
         if layer.words:
-            write_samples(run_dir / file_name(layer, ".csv"), layer.listed())
-    if geotiff_wanted(config.geotiff):
+            write_samples(run_dir / file_name(layer, ".csv"), layer.class_table())
+    if check_geotiff(config.geotiff):
         write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
     facts = {
         **field.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,

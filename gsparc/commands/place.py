@@ -7,8 +7,8 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.maps import placing
-from gsparc.apps.maps.pictures import draw_placing
-from gsparc.apps.maps.promised import promise_of, trained
+from gsparc.apps.maps.pictures import draw_placement
+from gsparc.apps.maps.promised import read_or_gather, reopen_training
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
@@ -30,17 +30,17 @@ def task(config: DictConfig) -> dict[str, Any]:
         "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
         "antenna": placing.Antenna(**settings["antenna"]),
     }  # fmt: skip
-    placing.place_next(predictor, count=1, dry=True, **query)  # refuses before anything is fitted
-    promise, error = promise_of(path, settings), placing.NewStation()
+    placing.place_station(predictor, count=1, dry=True, **query)  # refuses before anything is fitted
+    promise, error = read_or_gather(path, settings), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
-        error = placing.new_station_error(trained(path, settings["dataset"]), int(config.left_out))
-    found = placing.place_next(predictor, count=config.count, promise=promise, error=error, **query)
+        error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
+    found = placing.place_station(predictor, count=config.count, promise=promise, error=error, **query)
     columns = coordinates(found.places, predictor)
     columns |= {"coverage": found.coverage, "low": found.low, "high": found.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
-    draw_placing(found, run_dir / "place.png", level, unit)
+    draw_placement(found, run_dir / "place.png", level, unit)
     # Candidates come best first.
     x, y, z = found.places[0]
     where = f"({x:.2f}, {y:.2f}, {z:.2f})"

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.apps.maps.floor_plan import plan_of
+from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.geojson import write_line
-from gsparc.apps.maps.pictures import draw_plan_picture
-from gsparc.apps.maps.planning import plan_next
-from gsparc.apps.maps.promised import promise_of
+from gsparc.apps.maps.pictures import draw_measurement_plan
+from gsparc.apps.maps.planning import plan_measurements
+from gsparc.apps.maps.promised import read_or_gather
 from gsparc.commands.map import settings_of, stations_of
 from gsparc.commands.shared.output import coordinates, finish, run_directory
 from gsparc.commands.shared.settings import plain
@@ -23,11 +23,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Choose, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
     run_dir, settings = run_directory(), plain(config)
-    floor = plan_of(settings)
+    floor = read_plan_settings(settings)
     # Before anything is measured there is no model, and places are spread over the area.
     predictor = None if config.ckpt is None else load(config.ckpt)
-    promise = None if predictor is None else promise_of(str(config.ckpt), settings)
-    plan = plan_next(
+    promise = None if predictor is None else read_or_gather(str(config.ckpt), settings)
+    plan = plan_measurements(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
         plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
         promise=promise, least_gain_db=float(config.least_gain_db), route=config.route,
@@ -42,7 +42,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if walk:
         origin = None if predictor is None else predictor.site.georeference
         write_line(run_dir / "plan.geojson", plan.path, origin)
-    draw_plan_picture(plan, run_dir / "plan.png", promise, predictor, floor)
+    draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(plan.places), "plan/expected_error_db": plan.after_db,
         "plan/expected_error_before_db": plan.before_db,

@@ -39,7 +39,7 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    from gsparc.apps.export.serving import Limits, Server, application
+    from gsparc.apps.export.serving import Limits, Server, build_application
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
     needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -51,7 +51,7 @@ def task(config: DictConfig) -> None:
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
-    app = application(predictor, limits, token)
+    app = build_application(predictor, limits, token)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then

@@ -9,12 +9,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.apps.maps.floor_plan import plan_of
-from gsparc.apps.maps.making import place_of
-from gsparc.apps.view.building import cloud_colours, cloud_of
+from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.making import read_place
+from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
-from gsparc.apps.view.site_view import SiteView, grid_for
-from gsparc.apps.view.viewed import open_viewed
+from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.viewed import open_model
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
@@ -57,10 +57,10 @@ def check(save: Path | None, port: int) -> None:
 
 def view_of(settings: dict[str, Any]) -> SiteView:
     """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
-    plan = plan_of(settings)
-    viewed = open_viewed(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
-    at, other = (None if settings[k] is None else place_of(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, plan, grid_for(viewed, settings, plan), at, other)
+    plan = read_plan_settings(settings)
+    viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
+    at, other = (None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end"))
+    return SiteView(viewed, plan, plane_grid(viewed, settings, plan), at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:
@@ -77,13 +77,13 @@ def serve(view: SiteView, host: str, port: int) -> str:
 def write(view: SiteView, path: Path) -> str:
     """Write a page or a splat file, whole or not at all; return what is said then."""
     if path.suffix.lower() == ".html":
-        from gsparc.apps.view.server.page import page
+        from gsparc.apps.view.server.page import render_page
 
         with whole_file(path) as partial:
-            partial.write_text(page(view), encoding="utf-8")
+            partial.write_text(render_page(view), encoding="utf-8")
     else:
         name = view.viewed.stations[0]
-        cloud = cloud_of(view.viewed, name, view.station(name).measured)
+        cloud = model_gaussians(view.viewed, name, view.station(name).measured)
         if cloud is None:
             model = f"{view.viewed.predictor.method.name} of {view.viewed.site.name}"
             raise DataError(f"save={path}: {model} holds no Gaussians to write")

@@ -15,7 +15,7 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
-from gsparc.apps.maps import map_of
+from gsparc.apps.maps import predict_map
 from gsparc.commands.listing import COMMANDS
 
 
@@ -54,9 +54,9 @@ def test_every_layer_and_a_table(mapped):
 
 
 def test_the_promise_stays_with_the_model(mapped, model):
-    found = map_of(gsparc.load(model), step_m=5.0)
+    found = predict_map(gsparc.load(model), step_m=5.0)
     assert found.calibrated and np.isfinite(found.power_db).any()
-    far = map_of(gsparc.load(model), [0, 0, 200, 60], step_m=5.0)
+    far = predict_map(gsparc.load(model), [0, 0, 200, 60], step_m=5.0)
     assert np.isnan(far.power_db[:, :, -1]).all() and far.refused[:, -1].all()
     near, edge = far.expected_error_db[0, 5, 5], np.nanmax(far.expected_error_db[0])
     assert edge > near
@@ -84,7 +84,7 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
         began.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("gsparc.commands.map.promise_of", lambda *_: Timer(0.3, interrupt).start())
+    monkeypatch.setattr("gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start())
     answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
     assert answer.status == 130 and began and time.monotonic() - began[0] < 10, answer
     assert not [file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")]

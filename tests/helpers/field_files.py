@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 
-from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, packed
+from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, pack_form
 
 COMMON = 6  # numbers before those of the form
 SIZES = {
@@ -97,7 +97,7 @@ def mutated(form: Form, draw: np.random.Generator) -> bytes:
             )
             with np.errstate(over="ignore"):
                 value[at] = some[draw.integers(len(some))]
-    blob = bytearray(packed(Form(form.kind, numbers, arrays), np.zeros(3), float(draw.random() < 0.5)))
+    blob = bytearray(pack_form(Form(form.kind, numbers, arrays), np.zeros(3), float(draw.random() < 0.5)))
     if draw.random() < 0.3:
         _other_table(blob, draw)
     return with_checksum(blob)

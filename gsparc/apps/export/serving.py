@@ -52,7 +52,7 @@ class Limits(Checked):
     delay_ms: float = setting(2.0, number(0, 1000))
 
 
-class Places(BaseModel):
+class PlacesBody(BaseModel):
     """A request's body: world places of what moves [m]."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
@@ -188,7 +188,7 @@ class Batcher:
             return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
-def application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
+def build_application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
     """Return the routes: POST /predict, and /std for its deviations, GET /healthz.
 
     Args:
@@ -287,7 +287,7 @@ def _read(end: str, asked: Asked) -> np.ndarray:
     """World places (n, 3) float64 [m] of a body; raises ValueError."""
     try:
         raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
-        places = Places.model_validate_json(asked.body).places if raw is None else raw
+        places = PlacesBody.model_validate_json(asked.body).places if raw is None else raw
     except (ValidationError, ValueError):
         wanted = "little-endian float32, three a place" if asked.raw else '{"places": [[x, y, z], ...]}'
         raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None

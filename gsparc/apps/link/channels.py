@@ -57,7 +57,7 @@ class Channels:
         return Band(self.true[:, 0], self.predicted[:, 0], self.variance.nan_to_num(0.0))
 
 
-def channels(
+def predict_channels(
     method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray,
     antennas: slice = slice(None),
 ) -> Channels:  # fmt: skip
@@ -82,12 +82,12 @@ def channels(
         none = torch.full((len(batch),), torch.nan)
         variance, confidence = (none if x is None else x for x in (answer.variance, answer.confidence))
         parts.append((answer.mean, variance, confidence))
-    true, source = truth(data, rows, frequency_hz)
+    true, source = true_channels(data, rows, frequency_hz)
     predicted, variance, confidence = map(torch.cat, zip(*parts, strict=True))
     return Channels(true[:, antennas], predicted, variance, confidence, source)
 
 
-def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
+def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
     """True channels (n, A, K) in the data's units and frame, and how they were come by."""
     assert data.site.subcarriers_hz is not None
     if data.site.name == "argos-sim" and data.uplink is not None:
@@ -96,7 +96,7 @@ def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tup
     return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
 
 
-def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     error, own = judged(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
     return Evidence(rows, data.moving[rows], error, own | rivals(data, fold, rows))

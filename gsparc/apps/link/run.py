@@ -12,7 +12,7 @@ import pandas as pd
 
 from gsparc.apps.link import study
 from gsparc.apps.link.adaptation import Rates
-from gsparc.apps.link.channels import channels, on_band
+from gsparc.apps.link.channels import band_evidence, predict_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
@@ -50,8 +50,8 @@ class LinkStudy:
         self.one = slice(self.antenna, self.antenna + 1)
         # The PUSCH grid around the measured band's middle, whatever tones were measured.
         frequency_hz = centred(float(self.tones.mean()), self.spacing_hz, self.count)
-        grid = channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
-        evidence = on_band(grid, self.data, self.fold, self.fold.test)
+        grid = predict_channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
+        evidence = band_evidence(grid, self.data, self.fold, self.fold.test)
         promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
         kind, threshold, self.test, aside = accept(evidence, promise, *how)
@@ -79,7 +79,7 @@ class LinkStudy:
         """`beams/*` of all test positions, as nothing of a beam was chosen on any; empty for one antenna."""
         if self.data.target.shape[1] == 1:
             return {}
-        every = channels(self.method, self.data, self.fold.test, self.tones)
+        every = predict_channels(self.method, self.data, self.fold.test, self.tones)
         # `test` are numbers into the fold's test rows, as `accepted` are into `test`.
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
         return study.beam_facts(every.true, every.predicted, accepted)
@@ -87,10 +87,10 @@ class LinkStudy:
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Rate adaptation at every noise level and its facts."""
         own, other = (
-            channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
+            predict_channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = study.adapt(own, other, self.mcs)
+        rates = study.adapt_rates(own, other, self.mcs)
         return rates, study.rate_facts(rates, self.accepted)
 
     def send(
@@ -105,8 +105,9 @@ class LinkStudy:
         how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.states_variance
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
-        blocks = study.transmit(pusch, self.grid.band(), levels, sizes)
-        rates, surest = study.curves(blocks, self.accepted), study.acceptance(blocks, self.score, SHARES)
+        blocks = study.send_blocks(pusch, self.grid.band(), levels, sizes)
+        rates = study.error_curves(blocks, self.accepted)
+        surest = study.errors_by_acceptance(blocks, self.score, SHARES)
         facts = study.pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()

@@ -21,7 +21,7 @@ FALLBACK = "lmmse"
 LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
 
 
-def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
+def find_crossing(rate: pd.Series, target: float = 0.1) -> float | None:
     """Return where a curve over its index first falls below `target`, linear in its logarithm, or None."""
     # No error in all blocks sent: its logarithm is cut at 1e-6.
     x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
@@ -33,7 +33,7 @@ def crossing(rate: pd.Series, target: float = 0.1) -> float | None:
     return None
 
 
-def gain(true: Tensor, predicted: Tensor) -> Tensor:
+def beam_gain(true: Tensor, predicted: Tensor) -> Tensor:
     """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
     # Maximum ratio transmission: the conjugate prediction, normalised per tone.
     weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
@@ -42,11 +42,11 @@ def gain(true: Tensor, predicted: Tensor) -> Tensor:
     return received.mean(1) / single.mean(1).clamp_min(1e-30)
 
 
-def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
+def beam_loss_db(true: Tensor, predicted: Tensor) -> Tensor:
     """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN of silence."""
-    best = gain(true, true)
+    best = beam_gain(true, true)
     # Largest of both: a beam into a null would be infinitely bad.
-    return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))
+    return 10 * torch.log10(best / torch.maximum(beam_gain(true, predicted), LEAST * best))
 
 
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
@@ -67,9 +67,9 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         return facts
     for count in sorted({few, true.shape[1]}):
         there, guess = true[:, :count], predicted[:, :count]
-        loss = loss_db(there, guess).numpy()
-        best = gain(there, there).mean()
-        own = torch.maximum(gain(there, guess).mean(), LEAST * best)
+        loss = beam_loss_db(there, guess).numpy()
+        best = beam_gain(there, there).mean()
+        own = torch.maximum(beam_gain(there, guess).mean(), LEAST * best)
         here = {
             "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * own.log10()),
             "loss_db": float(10 * (best / own).log10()),
@@ -82,7 +82,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
     return facts
 
 
-def adapt(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
+def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
     """Rates at noise levels that put the median position at `snr_db` of the settings.
 
     Args:
@@ -158,7 +158,7 @@ def _by_regret(one: Rates) -> dict[str, float | None]:
     return facts
 
 
-def transmit(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int]) -> pd.DataFrame:
+def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int]) -> pd.DataFrame:
     """Blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
 
     Args:
@@ -179,7 +179,7 @@ def transmit(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, in
     return pd.concat(chain(*(blocks for _, blocks in each(at, levels, "Eb/N0"))), ignore_index=True)
 
 
-def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:
+def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:
     """Each receiver's curve on all and on accepted positions, and prediction with fallback on all.
 
     A curve's index is the Eb/N0 [dB], its columns `bler`, `ber` (NaN without a block), `errors`, `blocks`.
@@ -201,7 +201,7 @@ def curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame
 def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
     """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
     facts: dict[str, Any] = {}
-    crossings = {name: crossing(curve.bler) for name, curve in rates.items()}
+    crossings = {name: find_crossing(curve.bler) for name, curve in rates.items()}
     for name, curve in rates.items():
         stem, at = f"pusch/{modulation}/{name}", crossings[name]
         reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
@@ -215,7 +215,7 @@ def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str,
     return facts
 
 
-def acceptance(
+def errors_by_acceptance(
     blocks: pd.DataFrame, score: np.ndarray, shares: Sequence[float]
 ) -> tuple[float, pd.DataFrame]:
     """Return the Eb/N0 [dB] where perfect knowledge fails in about a tenth, and block error rates there.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.search import Looked
+from gsparc.apps.locate.search import Search
 
 # Bounds of the search, within which `of` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
@@ -17,7 +17,7 @@ SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 160
 
 
-def calibrated(snapshots: Sequence[Looked], places: np.ndarray, share: float, start: Trust) -> Trust:
+def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: float, start: Trust) -> Trust:
     """Return the trust under which held-out places are most likely, with an area that holds a share.
 
     All numbers but the level maximise the mean log density at the true places, a proper score; the level is
@@ -41,20 +41,20 @@ def calibrated(snapshots: Sequence[Looked], places: np.ndarray, share: float, st
 
     def surprise(point: np.ndarray) -> float:
         trust, pairs = of(point), zip(snapshots, places, strict=True)
-        return -float(np.mean([one.by(trust).at(place) for one, place in pairs]))
+        return -float(np.mean([one.posterior(trust).at(place) for one, place in pairs]))
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
     how = {"maxfev": LOOKS, "initial_simplex": simplex}
     optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
-    return levelled(of(optimum.x), snapshots, places, share)
+    return calibrate_level(of(optimum.x), snapshots, places, share)
 
 
-def levelled(trust: Trust, snapshots: Sequence[Looked], places: np.ndarray, share: float) -> Trust:
+def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
     """Return the trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
-    levels = np.sort([one.by(trust).level(place) for one, place in zip(snapshots, places, strict=True)])
+    levels = [one.posterior(trust).level(place) for one, place in zip(snapshots, places, strict=True)]
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
-    return replace(trust, level=float(levels[rank - 1]) if rank <= len(levels) else 1.0)
+    return replace(trust, level=float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0)

@@ -45,17 +45,17 @@ class Cells:
         edge = np.broadcast_to(self.edge[:, None] / 2, centre.shape)
         return Cells(centre.reshape(-1, 3), edge.reshape(-1, 3))
 
-    def with_others(self, others: Cells) -> Cells:
+    def join(self, others: Cells) -> Cells:
         """Return these cells and others."""
         return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
 
-    def holding(self, place: np.ndarray) -> int:
+    def index_of(self, place: np.ndarray) -> int:
         """Return the cell that a place (3,) is in, or that is nearest to it."""
         outside = (np.abs(self.centre - place) - self.edge / 2).clip(0) * (self.edge > 0)
         return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
 
 
-def cover(
+def cover_box(
     trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> Cells:
     """Return about `most` equal cells of the box of trained places (n, 3) [m].

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.locate.judging import Localisation, sample
-from gsparc.apps.locate.neighbours import located_by
+from gsparc.apps.locate.judging import Localisation, sample_rows
+from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
 from gsparc.data.datasets.fingerprints import Fingerprints, parted, read_fingerprints
 from gsparc.data.limits import POSITIVE, SHARE
@@ -19,7 +19,7 @@ from gsparc.data.limits import POSITIVE, SHARE
 METHOD = "weighted_knn"
 
 
-def by_fingerprints(config: DictConfig) -> Localisation:
+def locate_fingerprints(config: DictConfig) -> Localisation:
     """Locate rows of a file by its others, or rows of another file.
 
     Args:
@@ -42,18 +42,18 @@ def by_fingerprints(config: DictConfig) -> Localisation:
         known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
     else:
         known, heard = map(rows.at, parted(rows, how, *cut, int(config.seed)))
-    heard = heard.at(sample(config, len(heard.level)))
-    place, each_ms, fit_s = located_by(METHOD, as_snapshots(known), as_snapshots(heard))
+    heard = heard.at(sample_rows(config, len(heard.level)))
+    both = fingerprint_snapshots(heard), fingerprint_snapshots(known)
+    place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
     facts = {
         "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
     }  # fmt: skip
     placed = bool(np.isfinite(heard.position).all())
-    both = as_snapshots(heard), as_snapshots(known)
     return Localisation(METHOD, place, *both, np.zeros(3), placed, {}, None, each_ms, "", facts)
 
 
-def as_snapshots(rows: Fingerprints) -> Snapshots:
+def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:
     """Return rows as snapshots of powers."""
     values = torch.from_numpy(rows.level).double()
     return Snapshots("rssi", values, None, rows.position, np.arange(len(values)))

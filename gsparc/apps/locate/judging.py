@@ -16,13 +16,13 @@ from omegaconf import DictConfig
 from rich.table import Table
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.cells import Cells, cover
+from gsparc.apps.locate.cells import Cells, cover_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
-from gsparc.apps.locate.neighbours import located_by
-from gsparc.apps.locate.search import Unknown
+from gsparc.apps.locate.neighbours import locate_by_neighbours
+from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
-from gsparc.apps.locate.snapshots import Snapshots, snapshots
+from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpreted
 from gsparc.data.raw import read_raw
@@ -100,7 +100,7 @@ def report(
     for name in dict.fromkeys(against):
         if name not in places:
             stems[name] = stem = f"baseline/{name}"
-            beside = located_by(name, result.trained, heard)
+            beside = locate_by_neighbours(name, result.trained, heard)
             places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
     rows = []
     for name, place in places.items():
@@ -119,7 +119,7 @@ def report(
     return facts, shown, [sentence]
 
 
-def by_model(
+def locate_by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
 ) -> Localisation:
     """Locate the test rows of a trained model, or those of a file.
@@ -135,13 +135,13 @@ def by_model(
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    unknown, share = Unknown(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
     # What was learned earlier for other settings is refused: its areas would hold another share.
-    start = Trust() if config.calibrate else locating.restored(run.stored[0].extra, unknown, share)
+    start = Trust() if config.calibrate else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
-    cells = partial(cover, most=locating.MOST, around=config.prior == "trained", open_at=light)
+    cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     field, count = SiteField(run.predictor), 0
     locator = Locator(field, cells(data.moving[learned][:, :3]), unknown, start, share)
     if config.calibrate:
@@ -150,10 +150,10 @@ def by_model(
         if config.store:
             keep(config.ckpt, locating.trust_state(trust, unknown, share))
     heard, placed = _snapshots(config, run)
-    located, trained, origin = locator.locate(heard), snapshots(data, learned), data.site.origin
+    located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
     true = heard.place + origin if placed else None
-    shown_at = [locating.in_world(one, origin) for one in located]
+    shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     pairs = zip(located, heard.place, strict=True)
     inside = np.array([one.posterior.level(at) <= level for one, at in pairs]) if placed else None
@@ -175,7 +175,7 @@ def _trust(
         learned = run.retraining(**brief)
     except DataError as error:
         raise DataError(f"{error}: calibrate=0 goes without") from None
-    result = locating.trusted(learned, locator, int(config.calibrate), cells)
+    result = locating.learn_trust(learned, locator, int(config.calibrate), cells)
     log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
     return result
 
@@ -184,7 +184,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
-        heard = snapshots(run.data, rows_of(run.split.folds[0], config.eval_on))
+        heard = group_snapshots(run.data, rows_of(run.split.folds[0], config.eval_on))
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays
@@ -194,11 +194,11 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
         other = aligned(interpreted(raw, config.data), site)
-        heard = snapshots(other, np.arange(len(other)))
-    return heard.at(sample(config, len(heard))), placed
+        heard = group_snapshots(other, np.arange(len(other)))
+    return heard.at(sample_rows(config, len(heard))), placed
 
 
-def sample(config: DictConfig, count: int) -> np.ndarray:
+def sample_rows(config: DictConfig, count: int) -> np.ndarray:
     """Return numbers of at most `rows` of so many rows, drawn evenly."""
     if not count:
         raise ValueError("there is nothing to be located")

@@ -76,7 +76,7 @@ class Trust:
         return -0.5 * (spread + self.temperature * misfit.size) + self.temperature * misfit.silent
 
 
-def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
+def spectrum_misfit(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
     """Return the misfit of spectra (n, P) by means (G, P) and variances of a pixel (G, 1)."""
     spread = variance[:, 0].clamp_min(TINY)
     # |v - m|^2 as |v|^2 - 2 v m + |m|^2: one matrix product instead of an array (n, G, P).
@@ -87,7 +87,7 @@ def of_spectra(values: Tensor, mean: Tensor, variance: Tensor) -> Misfit:
     return Misfit(squared.clamp_min(0) / spread, size, count, torch.zeros_like(squared))
 
 
-def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: bool) -> Misfit:
+def channel_misfit(values: Tensor, mean: Tensor, variance: Tensor, phase_known: bool) -> Misfit:
     """Return the misfit of complex values (n, P), NaN where missing, by means and variances (G, P).
 
     Without a known phase each snapshot is turned to where it fits best.
@@ -103,7 +103,7 @@ def of_channels(values: Tensor, mean: Tensor, variance: Tensor, phase_known: boo
     return Misfit(squared, 2 * seen @ log_variance.T, 2 * seen.sum(1), torch.zeros_like(squared))
 
 
-def of_levels(
+def level_misfit(
     values: Tensor, mean: Tensor, variance: Tensor, offset_db: float = 0.0, floor: Tensor | None = None
 ) -> Misfit:
     """Return the misfit of powers (n, P) [dB], NaN where missing, by means, variances (G, P) [dB, dB^2].

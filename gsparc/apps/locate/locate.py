@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.apps.locate.cells import cover
-from gsparc.apps.locate.locator import MOST, Located, Locator, in_world, restored
-from gsparc.apps.locate.search import Unknown
+from gsparc.apps.locate.cells import cover_box
+from gsparc.apps.locate.locator import MOST, Located, Locator, restore_trust, to_world
+from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
-from gsparc.apps.locate.snapshots import of_values
+from gsparc.apps.locate.snapshots import snapshots_of_values
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
 
@@ -46,19 +46,19 @@ def locate(
         # By way of stored units: users give levels in the unit that answers come in.
         stored = site.power_unit(unit or predictor.unit).stored(torch.as_tensor(values))
         values = stored * site.target_scale
-    heard = of_values(site, values, silent)
+    heard = snapshots_of_values(site, values, silent)
     places = None if where is None else tuple(map(tuple, np.atleast_2d(read_places("where", where)).tolist()))
-    found = _locator(predictor, places, Unknown(phase_known, offset_db), share).locate(heard)
-    return [in_world(one, site.origin) for one in found]
+    found = _locator(predictor, places, Nuisances(phase_known, offset_db), share).locate(heard)
+    return [to_world(one, site.origin) for one in found]
 
 
 @lru_cache(maxsize=4)  # what a model says of the coarse grid is most of the time of the first snapshot
 def _locator(
-    predictor: Predictor, places: tuple[tuple[float, ...], ...] | None, unknown: Unknown, share: float
+    predictor: Predictor, places: tuple[tuple[float, ...], ...] | None, unknown: Nuisances, share: float
 ) -> Locator:
     """Of world places (m, 3); None: of the box of the measured ones."""
     site = predictor.site
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
-    trust = restored(predictor.extra, unknown, share)
-    cells = cover(local, MOST, places is not None)
+    trust = restore_trust(predictor.extra, unknown, share)
+    cells = cover_box(local, MOST, places is not None)
     return Locator(SiteField(predictor), cells, unknown, trust, share)

@@ -12,13 +12,13 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from gsparc.apps.locate.calibration import calibrated, levelled
+from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
 from gsparc.apps.locate.cells import Cells
 from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.posterior import Posterior, likeliest
-from gsparc.apps.locate.search import Looked, Unknown, misfit
+from gsparc.apps.locate.posterior import Posterior, densest_cells
+from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
-from gsparc.apps.locate.snapshots import Snapshots, snapshots
+from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -72,7 +72,7 @@ class Locator:
 
     field: SiteField
     cells: Cells
-    unknown: Unknown
+    unknown: Nuisances
     trust: Trust
     share: float = 0.9
 
@@ -81,22 +81,22 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.at(torch.from_numpy(self.cells.centre))
 
-    def look(self, heard: Snapshots, trust: Trust) -> Looked:
+    def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
-        current = Looked(self.cells, misfit(heard, self._coarse, self.unknown))
+        current = Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
         for _ in range(LEVELS):
             cells = current.cells
-            likely = likeliest(current.log_density(trust), cells.size, KEPT)
+            likely = densest_cells(current.log_density(trust), cells.size, KEPT)
             wide = cells.edge[likely].max(1)
             likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
             if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
                 break
             chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
             finer = cells.at(chosen).halved()
-            more = misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
+            more = compute_misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
             rest = np.setdiff1d(np.arange(len(cells)), chosen)
             others = current.misfit.at(torch.from_numpy(rest))
-            current = Looked(cells.at(rest).with_others(finer), others + more)
+            current = Search(cells.at(rest).join(finer), others + more)
         return current
 
     def locate(self, heard: Snapshots) -> list[Located]:
@@ -105,13 +105,13 @@ class Locator:
         results = []
         for number in range(len(heard)):
             started = time.perf_counter()
-            posterior = self.look(heard.at(np.array([number])), self.trust).by(self.trust)
+            posterior = self.search_cells(heard.at(np.array([number])), self.trust).posterior(self.trust)
             located = Located.of(posterior, self.trust.level, posterior.peak())
             results.append(replace(located, seconds=time.perf_counter() - started))
         return results
 
 
-def trusted(
+def learn_trust(
     learned: Learned, locator: Locator, folds: int, cells: Callable[[np.ndarray], Cells]
 ) -> tuple[Trust, int]:
     """Return how far such a method is trusted, from training places that it left out, and their number.
@@ -129,25 +129,25 @@ def trusted(
         method = learned.refit(inner, learned.context.within(f"group{number}"))
         field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
-        heard = snapshots(data, inner.test)
+        heard = group_snapshots(data, inner.test)
         sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
         pairs += [(without, heard.at(np.array([row]))) for row in sample]
     places = np.concatenate([heard.place for _, heard in pairs])
 
-    def looks(trust: Trust) -> list[Looked]:
-        return [without.look(heard, trust) for without, heard in pairs]
+    def looks(trust: Trust) -> list[Search]:
+        return [without.search_cells(heard, trust) for without, heard in pairs]
 
-    trust = calibrated(looks(locator.trust), places, locator.share, locator.trust)
+    trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
-    return levelled(trust, looks(trust), places, locator.share), len(places)
+    return calibrate_level(trust, looks(trust), places, locator.share), len(places)
 
 
-def trust_state(trust: Trust, unknown: Unknown, share: float) -> dict[str, Any]:
-    """Return what `restored` reads again, for a checkpoint's `extra`."""
+def trust_state(trust: Trust, unknown: Nuisances, share: float) -> dict[str, Any]:
+    """Return what `restore_trust` reads again, for a checkpoint's `extra`."""
     return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
 
 
-def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
+def restore_trust(extra: Mapping[str, Any], unknown: Nuisances, share: float) -> Trust:
     """Return the trust that `trust_state` held.
 
     Where nothing was, areas are as wide as the model's own variances say, which is logged.
@@ -159,7 +159,7 @@ def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
     if stored is None:
         log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
         return Trust(level=share)
-    before, promised = Unknown(**stored["unknown"]), stored["share"]
+    before, promised = Nuisances(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):
         settings = f"share={promised}, phase_known={before.phase_known}, offset_db={before.offset_db}"
         raise ValueError(
@@ -168,7 +168,7 @@ def restored(extra: Mapping[str, Any], unknown: Unknown, share: float) -> Trust:
     return Trust(**stored["trust"])
 
 
-def in_world(located: Located, origin: np.ndarray) -> Located:
+def to_world(located: Located, origin: np.ndarray) -> Located:
     """Return the same with places in the world's coordinates."""
     cells = replace(located.posterior.cells, centre=located.posterior.cells.centre + origin)
     posterior = replace(located.posterior, cells=cells)

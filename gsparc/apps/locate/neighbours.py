@@ -19,7 +19,7 @@ MAX_ROWS = 2_000  # that choose it
 BELOW = 0.02  # of the range of values, that a silent one is put below the least
 
 
-def located_by(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndarray, float, float]:
+def locate_by_neighbours(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndarray, float, float]:
     """Return places (n, 3) of snapshots by the nearest trained ones, weighed by their inverse distances.
 
     Args:
@@ -34,7 +34,7 @@ def located_by(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndar
         ValueError: nothing was heard in any of those that are learned from.
     """
     started = time.perf_counter()
-    known, asked, places = features(trained), features(heard), trained.place
+    known, asked, places = feature_vectors(trained), feature_vectors(heard), trained.place
     if not np.isfinite(known).any():
         raise ValueError(f"{name}: no row that could be learned from holds a value")
     floor = np.nanmin(known) - BELOW * (np.nanmax(known) - np.nanmin(known))
@@ -46,7 +46,7 @@ def located_by(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndar
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started
 
 
-def features(heard: Snapshots) -> np.ndarray:
+def feature_vectors(heard: Snapshots) -> np.ndarray:
     """Return real rows (n, P), NaN where nothing was heard.
 
     Of channels the real and imaginary parts after the first value that was heard was turned to be real and

@@ -19,7 +19,7 @@ LEAST = 1e-300
 SHIFTS, NEAR = 20, 0.01  # steps up the density at most, and of a width that the last one is shorter than
 
 
-def likeliest(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
+def densest_cells(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
     """Return the densest cells (c,) of G that hold a share of the mass, densest first."""
     order = np.argsort(-log_density, kind="stable")
     return order[: int(np.searchsorted(np.cumsum((np.exp(log_density) * size)[order]), share)) + 1]
@@ -60,7 +60,7 @@ class Posterior:
 
     def at(self, place: np.ndarray) -> float:
         """Log density at a place (3,) itself, not of its cell."""
-        here = self.cells.holding(place)
+        here = self.cells.index_of(place)
         if not self.spread:
             return float(self.sharp[here])
         rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
@@ -76,7 +76,7 @@ class Posterior:
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
         blurred = np.zeros(len(self.cells), bool)
-        blurred[likeliest(self.sharp, self.cells.size, BLURRED)] = True
+        blurred[densest_cells(self.sharp, self.cells.size, BLURRED)] = True
         return blurred
 
     def _density(self, places: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ class Posterior:
 
     def within(self, share: float) -> np.ndarray:
         """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
-        return likeliest(self.log_density, self.cells.size, share)
+        return densest_cells(self.log_density, self.cells.size, share)
 
     def modes(self, share: float) -> list[np.ndarray]:
         """Cells of each connected part of the area that holds a share of the mass, heaviest first."""

@@ -16,7 +16,7 @@ from gsparc.apps.locate.snapshots import Snapshots
 
 
 @dataclass(frozen=True)
-class Unknown:
+class Nuisances:
     """What differs by chance between snapshots.
 
     Attributes:
@@ -29,7 +29,7 @@ class Unknown:
 
 
 @dataclass(frozen=True)
-class Looked:
+class Search:
     """One snapshot's misfit at cells that were halved where it fits."""
 
     cells: Cells
@@ -40,15 +40,15 @@ class Looked:
         log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.size))
         return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
 
-    def by(self, trust: Trust) -> Posterior:
+    def posterior(self, trust: Trust) -> Posterior:
         """Return what is known of the place."""
         return Posterior(self.cells, self.log_density(trust), trust.spread)
 
 
-def misfit(heard: Snapshots, there: Moments, unknown: Unknown) -> Misfit:
+def compute_misfit(heard: Snapshots, there: Moments, unknown: Nuisances) -> Misfit:
     """Return the misfit of snapshots at places; see `gsparc.apps.locate.likelihood`."""
     if heard.kind == "spectrum":
-        return likelihood.of_spectra(heard.values, there.mean, there.variance)
+        return likelihood.spectrum_misfit(heard.values, there.mean, there.variance)
     if heard.kind == "csi":
-        return likelihood.of_channels(heard.values, there.mean, there.variance, unknown.phase_known)
-    return likelihood.of_levels(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)
+        return likelihood.channel_misfit(heard.values, there.mean, there.variance, unknown.phase_known)
+    return likelihood.level_misfit(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.apps.locate.snapshots import compared
+from gsparc.apps.locate.snapshots import flatten_targets
 from gsparc.data.query import Query
 from gsparc.prediction.predictor import Predictor
 
@@ -64,7 +64,7 @@ class SiteField:
         if prediction.variance is None:
             name = self.predictor.method.name
             raise ValueError(f"locate: {name} states no variance, and has no likelihood of a place")
-        mean, variance = compared(prediction.mean), prediction.variance.double()[:, None]
+        mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
             return Moments(mean.double(), variance)
         if site.kind == "rssi":

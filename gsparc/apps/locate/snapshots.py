@@ -41,7 +41,7 @@ class Snapshots:
         return Snapshots(self.kind, self.values[index], floor, self.place[chosen], self.rows[chosen])
 
 
-def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
+def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     """Rows (m,) of measurements as snapshots: rows of one place at different stations are one.
 
     Of several visits of a station to a place the first is of the first snapshot there, and so on.
@@ -54,13 +54,13 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     keys = np.c_[place, _repetition(np.c_[place, station])]
     _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     which = which.reshape(-1)
-    measured = compared(data.targets(rows))
+    measured = flatten_targets(data.targets(rows))
     measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
     if site.kind == "rssi":
         measured = _decibels(measured)
     side = torch.from_numpy(data.side(rows))
     if data.mask is not None:
-        mask = compared(torch.from_numpy(data.mask[rows])) | (side != 0)[:, None]
+        mask = flatten_targets(torch.from_numpy(data.mask[rows])) | (side != 0)[:, None]
         measured = torch.where(mask, measured, torch.full_like(measured, np.nan))
     values = torch.full((len(first), count, measured.shape[1]), np.nan, dtype=measured.dtype)
     values[which, station] = measured
@@ -70,7 +70,7 @@ def snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     return Snapshots(site.kind, *own, data.moving[rows][first], rows[first])
 
 
-def of_values(
+def snapshots_of_values(
     site: Site, values: np.ndarray | Tensor, silent: np.ndarray | Tensor | None = None
 ) -> Snapshots:
     """Snapshots at unknown places from what predictions of the site look like.
@@ -98,12 +98,12 @@ def of_values(
         raise ValueError("locate: there is a snapshot in which nothing was heard")
     scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
     flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
-    own = _decibels(flat) if site.kind == "rssi" else compared(flat).reshape(len(heard), -1)
+    own = _decibels(flat) if site.kind == "rssi" else flatten_targets(flat).reshape(len(heard), -1)
     parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
     return Snapshots(site.kind, *parts, np.full((len(heard), 3), np.nan), np.arange(len(heard)))
 
 
-def compared(targets: Tensor) -> Tensor:
+def flatten_targets(targets: Tensor) -> Tensor:
     """Targets (n, ...) as rows (n, P): of spectra every k-th row and column."""
     if targets.ndim == 3 and not targets.is_complex():
         step = max(round((targets[0].numel() / PIXELS) ** 0.5), 1)

@@ -62,7 +62,7 @@ class Grid:
         return self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half
 
 
-def grid_of(
+def lay_grid(
     site: Site | None, area: Any = None, height_m: float | None = None, step_m: float | None = None,
     plan: FloorPlan | None = None, stations: int = 1,
 ) -> Grid:  # fmt: skip

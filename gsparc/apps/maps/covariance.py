@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.making import ends_of, levels_at, local_of
+from gsparc.apps.maps.making import predict_levels, query_ends, to_local
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
 from gsparc.prediction.predictor import Predictor
@@ -32,7 +32,7 @@ class ErrorCovariance:
     noise: float
     weight: np.ndarray
 
-    def measured(self, place: int) -> None:
+    def condition_on(self, place: int) -> None:
         """Condition on a measurement at one of the places."""
         column = self.covariance[:, place].copy()
         self.covariance -= np.outer(column, column / (column[place] + self.noise))
@@ -47,7 +47,7 @@ class ErrorCovariance:
         return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
 
-def unknown_of(
+def error_covariances(
     predictor: Predictor, places: np.ndarray, stations: Sequence[str], promise: Promise | None,
     other_end: Sequence[float] | None = None,
 ) -> list[ErrorCovariance]:  # fmt: skip
@@ -62,7 +62,7 @@ def unknown_of(
     for name in stations:
         asking = predictor if predictor.site.stations is None else predictor.at(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
-        known = asking.covariance(**ends_of(asking.site, places, other_end))
+        known = asking.covariance(**query_ends(asking.site, places, other_end))
         if known is None:
             fault = "states no covariance of its errors; plan with model=gp or gsparc of powers"
             raise DataError(f"{asking.method.name} {fault}")
@@ -70,8 +70,8 @@ def unknown_of(
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
-            spread = levels_at(asking, places, other_end)[1]
-            local = local_of(asking.site, places, other_end, asking.site.static_end is None)
+            spread = predict_levels(asking, places, other_end)[1]
+            local = to_local(asking.site, places, other_end, asking.site.static_end is None)
             far = promise.distance(local, number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
             error = calibration.expected_error(spread, inside, np.full(len(far), number))
@@ -81,7 +81,7 @@ def unknown_of(
     return covariances
 
 
-def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
+def prior_covariances(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
     """Return the same where nothing was measured: shadowing about a level nobody knows, alike over
     `length_m`, else `SHARE_OF_SIDE` of the longer side of places (S, 3) [m].
     """

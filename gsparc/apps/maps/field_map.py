@@ -83,13 +83,13 @@ class FieldMap:
         """Cells (ny, nx) bool whose best server is less likely than not strongest and above its floor."""
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
-    def strongest(self, layers: np.ndarray) -> np.ndarray:
+    def at_best_server(self, layers: np.ndarray) -> np.ndarray:
         """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx); NaN where refused."""
         number = np.maximum(self.best_server, 0).astype(np.int64)
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
-    def raised(self, decibels: float, unit: str) -> FieldMap:
+    def in_unit(self, decibels: float, unit: str) -> FieldMap:
         """Return the same map with levels so many decibels higher, which is in another unit."""
         # Errors and probabilities do not change with the unit, differences of levels neither.
         levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
@@ -100,7 +100,7 @@ class FieldMap:
         if name == "best_server":
             return np.where(self.best_server == REFUSED, np.nan, self.best_server)
         values = getattr(self, name)
-        return self.strongest(values) if name in OF_STATIONS else values
+        return self.at_best_server(values) if name in OF_STATIONS else values
 
     def save(self, path: str | Path) -> None:
         """Write as npz, whole or not at all."""
@@ -127,7 +127,7 @@ class FieldMap:
             "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
             "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
             "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
-            "width_db": of(self.strongest(self.upper_db - self.lower_db)),
+            "width_db": of(self.at_best_server(self.upper_db - self.lower_db)),
             "expected_error_db": of(self.layer("expected_error_db"), _root_mean_square),
             "threshold_db": self.threshold_db,
             "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
@@ -139,7 +139,7 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def empty(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+def empty_layers(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
     """`ARRAYS` of a map (ny, nx) about which nothing is said yet."""
     shapes = {name: (stations, *shape) if name in OF_STATIONS else shape for name in ARRAYS}
     values = {name: np.full(size, np.nan, np.float32) for name, size in shapes.items()}
@@ -218,7 +218,7 @@ def sinr(
     return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
 
 
-def overlapping(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
+def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
     """Stations (n,) within `OVERLAP_DB` of the strongest of (T, n) powers [dB], itself too, on its carrier.
 
     Returns:
@@ -230,7 +230,7 @@ def overlapping(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
     return np.where(number == REFUSED, np.nan, near.sum(0)).astype(np.float32)
 
 
-def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
+def read_loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
     """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
 
     Raises:
@@ -248,7 +248,7 @@ def loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequenc
     return np.broadcast_to(values, (len(stations),))
 
 
-def geotiff_wanted(wanted: bool | None) -> bool:
+def check_geotiff(wanted: bool | None) -> bool:
     """Return whether a GeoTIFF is written; None: where it can be.
 
     Raises:

@@ -46,7 +46,7 @@ class FloorPlan:
         one, two = self.scale, -1j * self.scale
         return one.real, one.imag, two.real, two.imag, self.shift.real, self.shift.imag
 
-    def light(self, places: np.ndarray) -> np.ndarray:
+    def is_open(self, places: np.ndarray) -> np.ndarray:
         """Return whether there is open floor (m,), a light pixel, at world places (m, 2) [m]."""
         pixel = (places[:, 0] + 1j * places[:, 1] - self.shift) / self.scale
         column, row = np.floor(pixel.real).astype(int), np.floor(-pixel.imag).astype(int)
@@ -56,7 +56,7 @@ class FloorPlan:
         return np.asarray(within & (shade > DARK))
 
 
-def read_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> FloorPlan:
+def read_floor_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> FloorPlan:
     """Read an image and lay it on the floor by two points.
 
     Args:
@@ -100,7 +100,7 @@ def _checked(points: Any, path: str | Path) -> np.ndarray:
     return pairs
 
 
-def plan_of(settings: Mapping[str, Any]) -> FloorPlan | None:
+def read_plan_settings(settings: Mapping[str, Any]) -> FloorPlan | None:
     """Return the floor plan that `plan` and `plan_points` of settings name; None where they name none.
 
     Raises:
@@ -108,4 +108,4 @@ def plan_of(settings: Mapping[str, Any]) -> FloorPlan | None:
     """
     if settings["plan"] is None and settings["plan_points"] is not None:
         raise DataError("plan_points: goes with an image, plan=FILE")
-    return None if settings["plan"] is None else read_plan(settings["plan"], settings["plan_points"])
+    return None if settings["plan"] is None else read_floor_plan(settings["plan"], settings["plan_points"])

@@ -81,7 +81,7 @@ class Calibration:
     reach: float
     station: np.ndarray
 
-    def interval(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
+    def half_width(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
         """Half the interval (n,) [dB] at places of stations (n,); NaN out of reach."""
         return self._of(self.half, spread_db, distance, station)
 
@@ -89,7 +89,9 @@ class Calibration:
         """Root mean square error (n,) [dB]; NaN out of reach."""
         return self._of(self.rms, spread_db, distance, station)
 
-    def below(self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
+    def probability_below(
+        self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray
+    ) -> np.ndarray:
         """Probability (n,) that a measurement lies below a level; NaN where it is not known."""
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
@@ -129,8 +131,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     which = np.searchsorted(first, used.distance, side="right")
     bins = [used.at(np.flatnonzero(which == number)) for number in range(count)]
     middle = np.array([float(np.median(one.distance)) for one in bins])
-    spreads = [completed(one) for one in bins]
-    half = np.array([quantiles(np.abs(error), mass, level) for error, mass in spreads])
+    spreads = [error_distribution(one) for one in bins]
+    half = np.array([weighted_quantiles(np.abs(error), mass, level) for error, mass in spreads])
     rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
     typical = np.array([float(np.median(one.spread_db)) for one in bins])
     weight = np.array([len(one) for one in bins], float)
@@ -143,7 +145,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)), station)
 
 
-def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def error_distribution(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Errors (m,) in deviations and their masses, those of censored rows spread over the errors they allow.
 
     The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
@@ -171,7 +173,7 @@ def completed(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     return exact, mass
 
 
-def quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
     """Return values, of (n,) with masses (n,), below which shares lie; of equal ones as `np.quantile`."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(mass[order]) - mass[order]
@@ -182,8 +184,8 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
 
     def typical(part: Evidence) -> float:
-        error, mass = completed(part)
-        return float(quantiles(np.abs(error), mass, level))
+        error, mass = error_distribution(part)
+        return float(weighted_quantiles(np.abs(error), mass, level))
 
     whole = typical(used)
     factors = np.ones(int(used.station.max()) + 1)
@@ -202,12 +204,12 @@ def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.n
     return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
 
 
-def covered(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def interval_coverage(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Chances (n,) that a measurement lies in its interval, and widths (n,) [dB], NaN where nothing is said.
 
     Of what was measured they are 0 or 1; a censored row's is that of the errors which its level allows.
     """
-    half = calibration.interval(evidence.spread_db, evidence.distance, evidence.station)
+    half = calibration.half_width(evidence.spread_db, evidence.distance, evidence.station)
     return _inside(calibration, evidence, half), 2 * half
 
 
@@ -215,7 +217,7 @@ def _inside(calibration: Calibration, evidence: Evidence, half: np.ndarray) -> n
     side, mean = evidence.side, evidence.mean_db
     expected = calibration.expected_error(evidence.spread_db, evidence.distance, evidence.station)
     levels = mean - half, mean + half, evidence.level_db
-    low, high, bound = (calibration.below(level, mean, expected) for level in levels)
+    low, high, bound = (calibration.probability_below(level, mean, expected) for level in levels)
     allowed = np.where(side > 0, bound, 1 - bound)
     both = np.where(side > 0, np.minimum(high, bound) - low, high - np.maximum(low, bound))
     chance = np.clip(np.divide(both, allowed, out=np.zeros_like(both), where=allowed > 0), 0.0, 1.0)
@@ -247,7 +249,7 @@ class Coverage:
     silent_share: float
 
 
-def cross_validated(evidence: Evidence, share: float) -> Coverage:
+def cross_validate(evidence: Evidence, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
@@ -256,7 +258,7 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
     for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
         calibration, own_part = calibrate(evidence.at(rest), share), evidence.at(tried)
-        inside[tried], width[tried] = covered(calibration, own_part)
+        inside[tried], width[tried] = interval_coverage(calibration, own_part)
         own[tried] = _inside(calibration, own_part, half[tried])
     known = np.isfinite(width)
     return Coverage(
@@ -267,7 +269,7 @@ def cross_validated(evidence: Evidence, share: float) -> Coverage:
     )  # fmt: skip
 
 
-def distances(
+def nearest_distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
     """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""

@@ -12,7 +12,7 @@ from gsparc.prediction.predictor import Predictor
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
 
-def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
 
     The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error variance.
@@ -44,7 +44,7 @@ def predicted(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[n
     return level, np.where(spread > 0, spread, np.nan)
 
 
-def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and `Measurements.side` of these."""
     target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
     power = target if data.site.kind == "rssi" else target**2
@@ -60,7 +60,7 @@ def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return level, side
 
 
-def cells_of(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
+def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
     """Levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places (n, 3) [m].
 
     Args:

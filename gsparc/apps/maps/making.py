@@ -11,13 +11,14 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 
-from gsparc.apps.maps.area import Grid, grid_of
-from gsparc.apps.maps.field_map import FieldMap, best_server, empty, loads, overlapping, server_chance, sinr
+from gsparc.apps.maps import field_map
+from gsparc.apps.maps.area import Grid, lay_grid
+from gsparc.apps.maps.field_map import FieldMap, best_server, server_chance, sinr
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import Calibration
-from gsparc.apps.maps.levels import MAPPED, cells_of, predicted
-from gsparc.apps.maps.promise import Promise, stored_promise
-from gsparc.apps.maps.refining import refined
+from gsparc.apps.maps.levels import MAPPED, joint_levels, predicted_levels
+from gsparc.apps.maps.promise import Promise, read_promise
+from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.instantiate import suggest
@@ -35,7 +36,7 @@ BANDS = 1 << 16  # cells at a time of what follows from predictions
 OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
 
 
-def map_of(
+def predict_map(
     predictor: Predictor, area: Any = None, *, height_m: float | None = None, step_m: float | None = None,
     threshold_db: float = -100.0, stations: Sequence[str | int] | None = None,
     load: float | Sequence[float] | Mapping[str, float] = 1.0, noise_db: float | None = None,
@@ -45,13 +46,13 @@ def map_of(
 ) -> FieldMap:  # fmt: skip
     """Predict every cell of an area.
 
-    >>> field = map_of(gsparc.load("model.ckpt"), step_m=0.5)
+    >>> field = predict_map(gsparc.load("model.ckpt"), step_m=0.5)
     >>> len(field.power_db), bool(0 <= field.outage.mean() <= 1)
     (1, True)
 
     Args:
         predictor: of powers or channels.
-        area, height_m, step_m: see `grid_of`.
+        area, height_m, step_m: see `lay_grid`.
         threshold_db: of outage.
         stations: names or numbers; None: all that the model can answer for.
         load, noise_db: see `sinr`.
@@ -71,10 +72,10 @@ def map_of(
     site = predictor.site
     if site.kind not in MAPPED:
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
-    promise = stored_promise(predictor.extra) if promise == "stored" else promise
-    names, notes = answering(predictor, stations, promise)
-    grid = grid_of(site, area, height_m, step_m, plan, len(names))
-    load_of = loads(load, names)
+    promise = read_promise(predictor.extra) if promise == "stored" else promise
+    names, notes = choose_stations(predictor, stations, promise)
+    grid = lay_grid(site, area, height_m, step_m, plan, len(names))
+    load_of = field_map.read_loads(load, names)
     level = PowerUnit.of(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
@@ -83,18 +84,18 @@ def map_of(
         first = np.zeros_like(grid.inside)
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
-    calibration = own_deviations(share) if promise is None else promise.calibration(share)
-    values: dict[str, Any] = empty(len(names), grid.shape)
+    calibration = uncalibrated(share) if promise is None else promise.calibration(share)
+    values: dict[str, Any] = field_map.empty_layers(len(names), grid.shape)
     stride = _stride(grid, promise, tolerance_db)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     every, computed = np.flatnonzero(grid.inside), 0
-    joint = cells_of(predictor, grid.places(every[:1]), numbers) is not None
+    joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
     alike = np.zeros_like(values["power_db"])
     size = len(names) if joint else 1  # stations that are asked about at once
     for row in range(0, len(names), size):
         chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
         ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
-        parts, count = refined(ask, grid.inside, stride, tolerance_db)
+        parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
         parts = parts.reshape(-1, size, *grid.shape)
         values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
         alike[chosen] = parts[2] if joint else 0.0
@@ -105,16 +106,16 @@ def map_of(
     about = station_facts(site, numbers)
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
-    usual, floor = _usual(promise, numbers, noise_db)
+    usual, floor = _usual_levels(promise, numbers, noise_db)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
     overlap, errors_alike = np.full(grid.inside.size, np.nan, np.float32), alike.reshape(len(names), -1)
     for cells in _chunks(every, BANDS):
         mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
         far = np.zeros(mean.shape)
         if promise is not None:
-            local = local_of(site, grid.places(cells), other_end, site.static_end is None)
+            local = to_local(site, grid.places(cells), other_end, site.static_end is None)
             far = np.stack([promise.distance(local, number) for number in numbers])
-        half = calibration.interval(spread, far, numbers[:, None])
+        half = calibration.half_width(spread, far, numbers[:, None])
         # The strongest before anything is refused, to which `alike` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
         error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
@@ -128,11 +129,11 @@ def map_of(
             "server_chance": server_chance(
                 power, error, usual, floor, np.where(first == best, errors_alike[:, cells], 0.0)
             ),
-            "outage": calibration.below(threshold_db, power[strongest], error[strongest]),
+            "outage": calibration.probability_below(threshold_db, power[strongest], error[strongest]),
         }  # fmt: skip
         for name, layer in part.items():
             flat[name][..., cells] = layer
-        overlap[cells] = overlapping(power, carrier)
+        overlap[cells] = field_map.count_overlap(power, carrier)
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every cell lies more than {calibration.reach:.3g} m from what was measured"
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
@@ -142,16 +143,16 @@ def map_of(
         grid, **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=extra, places=np.unique(known, axis=0), notes=tuple(notes),
         unit=site.level_unit, **about,
-    ).raised(level.raised_db, level.name)  # fmt: skip
+    ).in_unit(level.raised_db, level.name)  # fmt: skip
 
 
-def own_deviations(share: float) -> Calibration:
+def uncalibrated(share: float) -> Calibration:
     """Intervals and errors as the model states them, everywhere."""
     half = np.array([norm.ppf((1 + share) / 2)])
     return Calibration(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
 
 
-def answering(
+def choose_stations(
     predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None,
     key: str = "stations",
 ) -> tuple[list[str], list[str]]:  # fmt: skip
@@ -220,9 +221,9 @@ def _asker(
     own = predictor if joint or predictor.site.stations is None else predictor.at(names[0])
 
     def one(cells: np.ndarray) -> np.ndarray:
-        if (every := cells_of(own, grid.places(cells), numbers) if joint else None) is not None:
+        if (every := joint_levels(own, grid.places(cells), numbers) if joint else None) is not None:
             return every.reshape(len(cells), -1)
-        return np.column_stack(levels_at(own, grid.places(cells), other))
+        return np.column_stack(predict_levels(own, grid.places(cells), other))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
@@ -235,20 +236,20 @@ def _asker(
     return ask
 
 
-def levels_at(
+def predict_levels(
     predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None,
     station: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted` and `ends_of`."""
+    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted_levels` and `query_ends`."""
     parts = []
     for part in _chunks(places, CHUNK):
-        ends = ends_of(predictor.site, part, other, station)
-        parts.append(predicted(predictor.linear(**ends), predictor.site.kind))
+        ends = query_ends(predictor.site, part, other, station)
+        parts.append(predicted_levels(predictor.linear(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 
 
-def ends_of(
+def query_ends(
     site: Site, places: np.ndarray, other: Sequence[float] | None, station: np.ndarray | None = None
 ) -> dict[End, np.ndarray]:
     """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
@@ -266,10 +267,10 @@ def ends_of(
         return {site.moving_end: places}
     if other is None:
         raise DataError(OTHER_END)
-    return {"rx": places, "tx": np.broadcast_to(place_of("other_end", other), places.shape)}
+    return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other), places.shape)}
 
 
-def place_of(name: str, value: Any) -> np.ndarray:
+def read_place(name: str, value: Any) -> np.ndarray:
     """(3,) [m] of the setting `name`; `DataError` where it is no place."""
     place = finite(value)
     if place.shape != (3,):
@@ -277,7 +278,7 @@ def place_of(name: str, value: Any) -> np.ndarray:
     return place
 
 
-def local_of(site: Site, places: np.ndarray, other: Sequence[float] | None, both: bool) -> np.ndarray:
+def to_local(site: Site, places: np.ndarray, other: Sequence[float] | None, both: bool) -> np.ndarray:
     """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
 
     Raises:
@@ -293,7 +294,7 @@ def local_of(site: Site, places: np.ndarray, other: Sequence[float] | None, both
     return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
 
 
-def _usual(
+def _usual_levels(
     promise: Promise | None, numbers: np.ndarray, noise_db: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and deviation (T, 2) of each station's measured levels, and its floor (T,) [dB].

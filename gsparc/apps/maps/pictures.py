@@ -17,7 +17,7 @@ from scipy.ndimage import label as areas_of
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.placing import Placing
+from gsparc.apps.maps.placing import Placement
 from gsparc.apps.maps.planning import Plan
 from gsparc.apps.maps.promise import Promise
 from gsparc.evaluation import from_above
@@ -86,14 +86,14 @@ class Layer:
         every = np.arange(len(self.words)) if self.group is None else self.group
         number = np.unique(every, return_inverse=True)[1]
         where = np.append(number, np.nan)[np.nan_to_num(self.values, nan=len(number)).astype(int)]
-        colours = np.asarray(colormaps["tab10"](shades(where, int(number.max()) + 1)[number]))
+        colours = np.asarray(colormaps["tab10"](assign_colours(where, int(number.max()) + 1)[number]))
         rank = np.tril(number[:, None] == number, -1).sum(1)
         shade = np.array(SHADES)[rank % len(SHADES)][:, None]
         # A positive share goes to white, a negative one to black.
         colours[:, :3] += np.abs(shade) * ((shade > 0) - colours[:, :3])
         return colours
 
-    def listed(self) -> dict[str, list[Any]]:
+    def class_table(self) -> dict[str, list[Any]]:
         """Return columns of its classes, largest first: number, name, share of the map and colour."""
         count = np.bincount(self.values[np.isfinite(self.values)].astype(int), minlength=len(self.words))
         order = [int(k) for k in np.argsort(-count, kind="stable") if count[k]]
@@ -104,7 +104,7 @@ class Layer:
         }  # fmt: skip
 
 
-def shades(classes: np.ndarray, count: int) -> np.ndarray:
+def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
     """Numbers (count,) below `MOST_COLOURS`, different for classes (ny, nx) that lie beside each other."""
     if count <= MOST_COLOURS:
         return np.arange(count)
@@ -125,7 +125,7 @@ def shades(classes: np.ndarray, count: int) -> np.ndarray:
     return result
 
 
-def named_areas(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
+def label_places(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
     """Row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
     # Deeper than a letter at the picture's size, or the name hides its area.
     least = max(DEEP * max(classes.shape), 1.5)
@@ -138,7 +138,7 @@ def named_areas(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[i
                 yield *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)), words[number]
 
 
-def layers(field: FieldMap) -> Iterator[Layer]:
+def list_layers(field: FieldMap) -> Iterator[Layer]:
     """Every layer of a map that says something; of several stations, also the power of each."""
     several, unit = len(field.stations) > 1, field.unit
     of = " of the strongest station" if several else ""
@@ -162,7 +162,7 @@ def layers(field: FieldMap) -> Iterator[Layer]:
         yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
     label = f"probability of less than {field.threshold_db:g} {unit}"
     yield Layer("outage", field.outage, Legend(label, 0.0, 1.0, "magma_r"))
-    error, width = field.layer("expected_error_db"), field.strongest(field.upper_db - field.lower_db)
+    error, width = field.layer("expected_error_db"), field.at_best_server(field.upper_db - field.lower_db)
     yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
     label = f"width of the {field.share:.0%} interval [dB]"
     yield Layer("width", width, Legend.over(label, width, "cividis"))
@@ -207,7 +207,7 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
     from_above.bounded(axis, (left, low), (right, high), title=title)
-    draw_places(axis, field)
+    draw_measured_and_stations(axis, field)
     from_above.scale_bar(axis)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
@@ -217,10 +217,10 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
 
 def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     """Names on their areas; those of the largest also in the legend."""
-    for row, column, word in named_areas(layer.values, layer.words):
+    for row, column, word in label_places(layer.values, layer.words):
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
                   path_effects=from_above.OUTLINE)  # fmt: skip
-    listed = layer.listed()
+    listed = layer.class_table()
     for colour, word in [*zip(listed["colour"], listed["station"], strict=True)][:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
     if len(listed["number"]) > MOST_COLOURS:
@@ -239,13 +239,13 @@ def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
 def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any) -> Any:
     """Values (ny, nx) of cells, through which a plan beneath them is seen."""
     if plan is not None:
-        draw_plan(axis, plan)
+        draw_floor_plan(axis, plan)
     # Not "nearest", which vector formats draw at the screen's resolution.
     how = {"origin": "lower", "extent": grid.extent, "interpolation": "none", "zorder": 2}
     return axis.imshow(values, alpha=1.0 if plan is None else 0.65, **how, **colours)
 
 
-def draw_plan(axis: Any, plan: FloorPlan) -> None:
+def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
     """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     a, b, c, d, e, f = plan.matrix()
@@ -253,7 +253,7 @@ def draw_plan(axis: Any, plan: FloorPlan) -> None:
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
-def draw_places(axis: Any, field: FieldMap) -> None:
+def draw_measured_and_stations(axis: Any, field: FieldMap) -> None:
     """Measured points and stations; those outside the map are left out."""
     left, right, low, high = field.grid.extent
     from_above.draw_measured(axis, field.places)
@@ -269,7 +269,7 @@ def draw_places(axis: Any, field: FieldMap) -> None:
             from_above.annotate(axis, name, where)
 
 
-def draw_plan_picture(
+def draw_measurement_plan(
     batch: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
 ) -> None:
     """Expected error before and after, the chosen places, and how it falls."""
@@ -305,7 +305,7 @@ def draw_plan_picture(
     save(figure, path, 100)
 
 
-def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = "dB") -> None:
+def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)

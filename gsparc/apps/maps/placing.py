@@ -11,9 +11,9 @@ from scipy.stats import norm
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.intervals import Evidence
-from gsparc.apps.maps.making import levels_at, map_of
+from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
-from gsparc.apps.maps.promise import Promise, evidence_of
+from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.blocks import evenly
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
@@ -72,7 +72,7 @@ class Antenna(Checked):
 
 
 @dataclass(frozen=True)
-class NewStation:
+class NewStationError:
     """How wrong the model is about a station that it never heard.
 
     Attributes:
@@ -87,7 +87,7 @@ class NewStation:
 
 
 @dataclass(frozen=True)
-class Placing:
+class Placement:
     """Candidates for one more station, the best first.
 
     Attributes:
@@ -107,26 +107,26 @@ class Placing:
     before: float
     grid: Grid
     stations: np.ndarray
-    error: NewStation
+    error: NewStationError
 
 
-def place_next(
+def place_station(
     predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0, height_m: float | None = None,
     sites: Any = None, station_height_m: float | None = None, count: int = 100,
-    promise: Promise | None = None, error: NewStation | None = None, antenna: Antenna | None = None,
+    promise: Promise | None = None, error: NewStationError | None = None, antenna: Antenna | None = None,
     dry: bool = False,
-) -> Placing:  # fmt: skip
+) -> Placement:  # fmt: skip
     """Try one more station at every candidate.
 
     Args:
         predictor: of powers at several stations, learned together.
-        area, height_m, threshold_db: see `map_of`.
+        area, height_m, threshold_db: see `predict_map`.
         sites: where a station may stand: GeoJSON of polygons or lines, or a table of places (see
             `read_query_places`), all of which are tried; None: the whole area.
         station_height_m: world; None: the middle height of the stations that stand.
         count: candidates, about.
         antenna: of the new station.
-        promise: see `map_of`, of the stations that stand.
+        promise: see `predict_map`, of the stations that stand.
         error: see `new_station_error`; None: the model's own deviations.
         dry: predict one cell of each station that stands alone: whether everything asked for is possible.
 
@@ -150,12 +150,12 @@ def place_next(
     except ValueError as refused:
         raise unheard_stations_error(f"{predictor.method.name} ({refused})") from None
     left, right, south, north = grid.extent
-    now = map_of(
+    now = predict_map(
         predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
         threshold_db=threshold_db, promise=promise, dry=dry,
     )  # fmt: skip
     old_outage = np.nan_to_num(now.outage[grid.inside], nan=1.0)
-    error = error or NewStation()
+    error = error or NewStationError()
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
@@ -173,16 +173,16 @@ def place_next(
     before = float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
     value, low, high = scores[order].T
-    return Placing(candidates[order], value, low, high, before, grid, still[:, :2], error)
+    return Placement(candidates[order], value, low, high, before, grid, still[:, :2], error)
 
 
-def new_station_error(learned: Learned, most: int = 4) -> NewStation:
+def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     """Leave out whole stations, up to `most`, and predict them from the others."""
     data, known = learned.data, learned.rows
     assert data.site.stations is not None and data.station is not None
     heard = np.unique(data.station[known])
     if len(heard) < LEAST_STATIONS:
-        return NewStation()
+        return NewStationError()
     # By the seed of the training: the same stations are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
@@ -190,16 +190,16 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStation:
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        parts.append(evidence_of(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
+        parts.append(held_out_evidence(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
     parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
     if not parts:
-        return NewStation()
+        return NewStationError()
     errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
     means = np.array([error.mean() for error in errors])
     pairs = zip(errors, means, parts, strict=True)
     inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
     within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
-    return NewStation(float(np.sqrt(np.mean(means**2))), within, len(means))
+    return NewStationError(float(np.sqrt(np.mean(means**2))), within, len(means))
 
 
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> np.ndarray:
@@ -226,7 +226,7 @@ def _new(
     if known is None and antenna.azimuth is not None:
         raise DataError(f"antenna.azimuth: {predictor.method.name} knows no patterns; model=gsparc does")
     if known is None:
-        level, spread = levels_at(predictor, cells, station=place)
+        level, spread = predict_levels(predictor, cells, station=place)
     else:
         strongest = known[0].argmax(1)[:, None]
         level, spread = (np.take_along_axis(part, strongest, 1)[:, 0] for part in known)

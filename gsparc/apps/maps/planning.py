@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.apps.maps.area import Grid, grid_of
-from gsparc.apps.maps.covariance import ErrorCovariance, before_measuring, unknown_of
+from gsparc.apps.maps.area import Grid, lay_grid
+from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.apps.maps.making import answering
+from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
@@ -83,7 +83,7 @@ class Plan:
         )
 
 
-def plan_next(
+def plan_measurements(
     predictor: Predictor | None, count: int = 20, area: Any = None, *, height_m: float | None = None,
     walkable: Any = None, plan: FloorPlan | None = None, stations: Sequence[str | int] | None = None,
     other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
@@ -92,17 +92,17 @@ def plan_next(
 ) -> Plan:  # fmt: skip
     """Choose places to measure next, as a batch.
 
-    >>> plan = gsparc.apps.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
+    >>> plan = gsparc.apps.maps.plan_measurements(gsparc.load("model.ckpt"), count=20, route=True)
     >>> plan.places.shape, plan.after_db < plan.before_db
     ((20, 3), True)
 
     Args:
         predictor: of powers; None before anything is measured, with `area` or `plan`.
         count: places wanted.
-        area, height_m, plan: see `grid_of`; with a promise and neither area nor plan, what it answers for.
+        area, height_m, plan: see `lay_grid`; with a promise and neither area nor plan, what it answers for.
         walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets, along which
             the walk then goes; None: the whole area.
-        stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
+        stations, other_end: see `predict_map`; what is measured at a place is measured of all of them.
         promise: evidence of held-out blocks, which scales the model's own variances.
         least_gain_db: stop where a place takes less than this off the expected error.
         route: whether places are put in the order of a short walk, or drive; None: with `walkable`.
@@ -124,19 +124,19 @@ def plan_next(
         places, first = np.concatenate([targets, allowed]), len(targets)
     # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
-        unknown = before_measuring(places, length_m)
+        unknown = prior_covariances(places, length_m)
     else:
-        names, _ = answering(predictor, stations)
-        unknown = unknown_of(predictor, places, names, promise, other_end)
+        names, _ = choose_stations(predictor, stations)
+        unknown = error_covariances(predictor, places, names, promise, other_end)
     begin = np.zeros((0, 2)) if start is None else _start(start)
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
     before, before_db = mean_error(unknown), _expected(unknown, wanted)
-    chosen, expected, stopped = greedy(unknown, first, wanted, count, least_gain_db, tour)
+    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
     walk = (walkable is not None if route is None else route) or route_m is not None
     order = np.array([chosen.index(one) for one in tour.stops], np.int64) if walk else np.arange(len(chosen))
-    path = ways.through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
+    path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
         places[first:][np.array(chosen, np.int64)[order]], np.array(expected)[order], before_db, order,
@@ -150,7 +150,7 @@ def coarse_grid(
     promise: Promise | None = None,
 ) -> Grid:  # fmt: skip
     """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
-    fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
+    fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
         far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.shape)
@@ -198,7 +198,7 @@ def walkable_places(
     return np.column_stack([places, np.full(len(places), grid.height)]), streets
 
 
-def greedy(
+def choose_greedily(
     unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
     tour: Tour,
 ) -> tuple[list[int], list[float], str]:  # fmt: skip
@@ -213,7 +213,7 @@ def greedy(
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
         gains = np.sum([one.gains(wanted)[first:] for one in unknown], axis=0)
-        possible = free & tour.within()[: len(free)]
+        possible = free & tour.addable()[: len(free)]
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"
@@ -224,7 +224,7 @@ def greedy(
         if gain < least_gain_db:
             return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
-            one.measured(first + best)
+            one.condition_on(first + best)
         error = _expected(unknown, wanted)
         chosen.append(best)
         expected.append(error)

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
-from gsparc.apps.maps.levels import measured, predicted
+from gsparc.apps.maps import intervals
+from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate
+from gsparc.apps.maps.levels import measured_levels, predicted_levels
 from gsparc.data.errors import DataError
 from gsparc.data.executor import each
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
@@ -68,19 +69,19 @@ class Promise:
         return calibrate(self.evidence, share)
 
     def coverage(self, share: float = 0.9) -> Coverage:
-        """See `gsparc.apps.maps.intervals.cross_validated`."""
-        return cross_validated(self.evidence, share)
+        """See `gsparc.apps.maps.intervals.cross_validate`."""
+        return intervals.cross_validate(self.evidence, share)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
         """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
-        return distances(self.known, self.station, places, np.full(len(places), station))
+        return intervals.nearest_distances(self.known, self.station, places, np.full(len(places), station))
 
     def keep(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
         keep(path, {KEY: asdict(self)})
 
 
-def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
+def read_promise(extra: Mapping[str, Any]) -> Promise | None:
     """Return what a checkpoint's `extra` holds; None where its map was never calibrated."""
     state = extra.get(KEY)
     if state is None:
@@ -89,7 +90,7 @@ def stored_promise(extra: Mapping[str, Any]) -> Promise | None:
     return Promise(evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"])
 
 
-def gather(learned: Learned, settings: PromiseSettings) -> Promise:
+def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     """Learn `settings.folds` times without blocks of the training rows, and ask about these.
 
     Args:
@@ -121,23 +122,24 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.
         unit = cut.unit[tried] + number * (len(data) + 1)
-        return evidence_of(less, data, replace(inner, test=tried), unit)
+        return held_out_evidence(less, data, replace(inner, test=tried), unit)
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     by_number = dict(each(evidence_without, folds, "fits without blocks of places"))
     # In the order of folds, whichever ended first: evidence must not depend on it.
     parts = [by_number[number] for number in folds]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
-    return Promise(evidence, places, station_of(data, learned.rows), side)
+    return Promise(evidence, places, station_numbers(data, learned.rows), side)
 
 
-def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
+def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
     """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
-    level, side = measured(data, rows)
-    station = station_of(data, rows)
-    far = distances(data.moving[known], station_of(data, known), data.moving[rows], station)
+    level, side = measured_levels(data, rows)
+    station = station_numbers(data, rows)
+    before = data.moving[known], station_numbers(data, known)
+    far = intervals.nearest_distances(*before, data.moving[rows], station)
     evidence = Evidence(level, mean, spread, far, block, station, side)
     return evidence.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
 
@@ -146,10 +148,10 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[
     """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
     mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     for chosen, _, said in predictions(method, data, rows, CHUNK):
-        mean[chosen], spread[chosen] = predicted(said, data.site.kind, data.site.target_scale)
+        mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
     return mean, spread
 
 
-def station_of(data: Measurements, rows: np.ndarray) -> np.ndarray:
+def station_numbers(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Numbers (n,) int64; 0 where there is one."""
     return np.zeros(len(rows), np.int64) if data.station is None else data.station[rows].astype(np.int64)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage
-from gsparc.apps.maps.promise import Promise, PromiseSettings, gather, stored_promise
+from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
 from gsparc.data.errors import DataError
 from gsparc.evaluation.open_runs import open_files
 from gsparc.models import checkpoint
@@ -19,7 +19,7 @@ from gsparc.prediction.refit import Learned
 log = logging.getLogger(__name__)
 
 
-def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
+def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     """Return the evidence stored with a model, or gathered from its training data and then stored.
 
     Args:
@@ -33,19 +33,19 @@ def promise_of(path: str, settings: Mapping[str, Any]) -> Promise | None:
     if not settings["promised"]:
         return None
     stored = checkpoint.read(path)
-    promise = None if settings.get("renew") else stored_promise(stored.extra)
+    promise = None if settings.get("renew") else read_promise(stored.extra)
     # Blocks of another size are other evidence.
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
-    learned = trained(path, settings["dataset"])
+    learned = reopen_training(path, settings["dataset"])
     log.info("a promise for this map: %d fits without blocks of places", how.folds)
-    promise = gather(learned, how)
+    promise = gather_promise(learned, how)
     promise.coverage(how.share)  # too little evidence is said before anything is stored
     promise.keep(path)
     return promise
 
 
-def trained(path: str, dataset: dict[str, Any]) -> Learned:
+def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
     """Return a model with the very data and rows that it was trained on.
 
     Raises:
@@ -64,7 +64,7 @@ def trained(path: str, dataset: dict[str, Any]) -> Learned:
     return learned
 
 
-def notes_of(field: FieldMap, coverage: Coverage | None) -> list[str]:
+def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     """Return what a reader of the map must know."""
     notes = [*field.notes]
     figures = field.figures()

@@ -12,7 +12,7 @@ Ask = Callable[[np.ndarray], np.ndarray]  # flat cells (n,) -> values (n, C)
 LEAST_NODES = 16  # along a side
 
 
-def refined(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tuple[np.ndarray, int]:
+def sample_adaptively(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tuple[np.ndarray, int]:
     """Values (C, ny, nx) float32 of cells, NaN outside, and how many were asked about.
 
     A lattice is asked about, and every cell near which interpolation from it and from every second of its

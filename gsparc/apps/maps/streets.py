@@ -77,7 +77,7 @@ class Ways:
         along = ((off == 0) | (off == 0)[:, None]) & np.isfinite(ways)
         return cls(places, np.where(along, ways, length), along, near, streets)
 
-    def through(self, order: np.ndarray) -> np.ndarray:
+    def path_through(self, order: np.ndarray) -> np.ndarray:
         """Return the corners (m, 2) [m] of the way through places in an order (n,)."""
         corners = [self.places[order[:1]]]
         for one, two in pairwise(order):
@@ -116,7 +116,7 @@ class Tour:
         """Return what has been walked at each stop (n,) [m]."""
         return np.cumsum(self.length[self.walk[:-2], self.walk[1:-1]])
 
-    def within(self) -> np.ndarray:
+    def addable(self) -> np.ndarray:
         """Return which places can be added, (S,) bool."""
         if self.longest is None:
             return np.ones(len(self.length) - 1, bool)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.apps.maps.levels import predicted
+from gsparc.apps.maps.levels import predicted_levels
 from gsparc.prediction.channels import Paths
 from gsparc.prediction.predictor import Predictor
 
@@ -53,7 +53,7 @@ class Rays:
     towards: np.ndarray | None
 
 
-def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
+def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     """Predict at world places (3,) [m] of the ends that move, of one station where there are several.
 
     Raises:
@@ -67,7 +67,7 @@ def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
         still[site.static_end] = site.static_position + site.origin
     level = spread = None
     if kind != "spectrum":
-        level, spread = (float(value[0]) for value in predicted(prediction, kind))
+        level, spread = (float(value[0]) for value in predicted_levels(prediction, kind))
     return Answer(
         {**still, **ends}, level, spread,
         None if prediction.confidence is None else float(prediction.confidence[0]),
@@ -89,10 +89,10 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
         return None
     delay = np.asarray(paths.delay_s[0], np.float64).mean(axis=0) * 1e9
     towards = None if paths.direction is None else np.asarray(paths.direction[0], np.float64)
-    return rays(paths.gain[0], delay, towards)
+    return merge_paths(paths.gain[0], delay, towards)
 
 
-def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
+def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
     """Paths as they are shown; those that several searches found alike are one, of their summed gain.
 
     Args:

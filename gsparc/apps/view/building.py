@@ -40,7 +40,9 @@ PATHS = Legend(
 VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
-def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured: Measured | None) -> Scene:
+def build_scene(
+    viewed: Viewed, plan: FloorPlan | None, station: str | None, measured: Measured | None
+) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
     points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
@@ -71,7 +73,7 @@ def build(viewed: Viewed, plan: FloorPlan | None, station: str | None, measured:
         parts.append(_mesh(f"mirror {number}", [square], MIRROR, 0.12))
     for number, box in enumerate(objects.boxes + origin):
         parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
-    cloud = cloud_of(viewed, station, measured)
+    cloud = model_gaussians(viewed, station, measured)
     if cloud is not None:
         parts.append(_cloud_part(cloud, legends, extent))
     faces = np.array(box_faces(*viewed.box()))
@@ -104,7 +106,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
     return legend, legend.of(level)
 
 
-def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
+def model_gaussians(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
     """Gaussians that are rendered, in world coordinates; None: of a model without."""
     low, high = viewed.box()
     places = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
@@ -167,7 +169,7 @@ class Sphere:
         return Legend("", 0.0, 1.0, "inferno").of(spectrum[self.rows, self.columns])
 
 
-def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
+def ray_parts(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     """Paths as lines from the receiver towards where they come from, as long as their delays, and the sources
     at the ends of those that are drawn whole.
 

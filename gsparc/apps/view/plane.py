@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.making import levels_at
+from gsparc.apps.maps.making import predict_levels
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.scene import Sheet
 from gsparc.prediction.predictor import Predictor
@@ -36,7 +36,7 @@ class Plane:
     stride: int
 
 
-def refining(
+def refine_plane(
     predictor: Predictor, grid: Grid, other: Sequence[float] | None = None
 ) -> Iterator[Plane | None]:
     """Planes of ever smaller strides; None between them, about every `STEP_S`.
@@ -53,7 +53,7 @@ def refining(
         cells, start = np.flatnonzero(chosen), 0
         while start < len(cells):
             begin, part = time.perf_counter(), cells[start : start + chunk]
-            level.reshape(-1)[part] = levels_at(predictor, grid.places(part), other)[0]
+            level.reshape(-1)[part] = predict_levels(predictor, grid.places(part), other)[0]
             start += len(part)
             took = time.perf_counter() - begin
             chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
@@ -71,7 +71,7 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
     return np.where(grid.inside, np.where(np.isfinite(level), level, repeated), np.nan)
 
 
-def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
+def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
     """Return a picture of values (ny, nx) over the cells, clear where not finite, `beneath` [m] lower.
 
     Half a dot lower, dots of the same height are seen whole.
@@ -85,7 +85,7 @@ def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: fl
     )  # fmt: skip
 
 
-def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
+def weakest_place(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
     """World place (3,) [m] of the cell of least power, `APART` of the plane's width from places `seen` (3,).
 
     None where there is none.

@@ -16,7 +16,7 @@ from gsparc.apps.view.scene import Faces, Part
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
 
 
-def reasons(answer: Answer, moving: str, tree: cKDTree | None) -> list[str]:
+def explain_level(answer: Answer, moving: str, tree: cKDTree | None) -> list[str]:
     """Why the level is what it is, one line each.
 
     Args:

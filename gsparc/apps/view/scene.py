@@ -34,12 +34,12 @@ class Frame:
         # 1 mm: a single place has a frame, too.
         return cls((low + high) / 2, EXTENT / max(float((high - low).max()), 1e-3))
 
-    def drawn(self, places: np.ndarray) -> np.ndarray:
+    def to_drawn(self, places: np.ndarray) -> np.ndarray:
         """World places (..., 3) [m] as float32 in drawn units; float64 until the middle is taken away."""
         # Float32 of UTM metres moves in steps of half a metre.
         return np.asarray((places - self.middle) * self.scale, np.float32)
 
-    def world(self, points: np.ndarray) -> np.ndarray:
+    def to_world(self, points: np.ndarray) -> np.ndarray:
         """Return the inverse of `drawn`, float64."""
         return np.asarray(points, np.float64) / self.scale + self.middle
 
@@ -56,8 +56,8 @@ class Points:
     def draw(self, api: Any, frame: Frame) -> Any:
         """Add it to a scene of viser under its name, in place of what had it; returns viser's handle."""
         return api.add_point_cloud(
-            path_of(self.name), frame.drawn(self.places), self.colours, point_size=self.size * frame.scale,
-            point_shape="circle", precision="float32", point_shading="flat",
+            node_path(self.name), frame.to_drawn(self.places), self.colours, point_shape="circle",
+            point_size=self.size * frame.scale, precision="float32", point_shading="flat",
         )  # fmt: skip
 
 
@@ -71,9 +71,9 @@ class Lines:
 
     def draw(self, api: Any, frame: Frame) -> Any:
         """See `Points.draw`."""
-        places, colours = frame.drawn(self.segments), np.repeat(self.colours[:, None], 2, axis=1)
+        places, colours = frame.to_drawn(self.segments), np.repeat(self.colours[:, None], 2, axis=1)
         how = {"thickness": THICKNESS, "thickness_units": "screen"}
-        return api.add_line_segments(path_of(self.name), places, colours, **how)
+        return api.add_line_segments(node_path(self.name), places, colours, **how)
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class Faces:
 
     def draw(self, api: Any, frame: Frame) -> Any:
         """See `Points.draw`."""
-        corners = frame.drawn(self.triangles).reshape(-1, 3)
+        corners = frame.to_drawn(self.triangles).reshape(-1, 3)
         return api.add_mesh_simple(
-            path_of(self.name), corners, np.arange(len(corners)).reshape(-1, 3), color=self.colour,
+            node_path(self.name), corners, np.arange(len(corners)).reshape(-1, 3), color=self.colour,
             opacity=self.opacity, side="double", flat_shading=True, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
@@ -115,9 +115,9 @@ class Sheet:
         x, y = self.right / wide, self.down / tall
         turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
         return api.add_image(
-            path_of(self.name), self.image, float(wide * frame.scale), float(tall * frame.scale),
+            node_path(self.name), self.image, float(wide * frame.scale), float(tall * frame.scale),
             cast_shadow=False, receive_shadow=False, wxyz=turn,
-            position=frame.drawn(self.corner + (self.right + self.down) / 2),
+            position=frame.to_drawn(self.corner + (self.right + self.down) / 2),
         )  # fmt: skip
 
 
@@ -131,14 +131,14 @@ class Mark:
 
     def draw(self, api: Any, frame: Frame) -> Any:
         """See `Points.draw`."""
-        name, where = path_of(self.name), frame.drawn(self.place)
+        name, where = node_path(self.name), frame.to_drawn(self.place)
         ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=where)
         if self.text:
             api.add_label(f"{name}/name", self.text, position=(0, 0, 0.02 * EXTENT), anchor="bottom-center")
         return ball
 
 
-def path_of(name: str) -> str:
+def node_path(name: str) -> str:
     """Return the path of a node, its name without what separates nodes."""
     return "/" + name.replace("/", " ")
 

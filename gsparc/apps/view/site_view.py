@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.apps.maps.area import Grid, grid_of
+from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.building import VALUES, Sphere, build, start_place
-from gsparc.apps.view.plane import Plane, refining
+from gsparc.apps.view.building import VALUES, Sphere, build_scene, start_place
+from gsparc.apps.view.plane import Plane, refine_plane
 from gsparc.apps.view.scene import EXTENT, Points, Scene
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly
@@ -85,7 +85,7 @@ class SiteView:
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
         measured = viewed.measured(name)
-        scene = build(viewed, self.plan, name, measured)
+        scene = build_scene(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
         tree = None
         if measured is not None and viewed.site.static_end is not None:
@@ -116,19 +116,19 @@ class SiteView:
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""
         other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
-        *_, plane = refining(self.viewed.predictor_of(name), grid, other)
+        *_, plane = refine_plane(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
         return plane
 
 
-def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
+def plane_grid(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
     """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
     if viewed.site.kind not in MAPPED:
         return None
-    return grid_of(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
+    return lay_grid(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
 
 
-def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
+def walk_places(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
     """Return at most `count` measured places in the order of measuring, or along the box's diagonal."""
     measured = view.station(name).measured
     if measured is None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.apps.maps import levels
-from gsparc.apps.maps.making import answering
+from gsparc.apps.maps.making import choose_stations
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import aligned, open_files
 from gsparc.prediction.operating_point import load
@@ -108,7 +108,7 @@ class Viewed:
             values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
             label = "mean of a measured spectrum"
         else:
-            values, side = levels.measured(data, rows)
+            values, side = levels.measured_levels(data, rows)
             # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
             what = "received power" if data.site.kind == "rssi" else "power of a channel"
@@ -116,7 +116,7 @@ class Viewed:
         return Measured(places, values, label)
 
 
-def open_viewed(
+def open_model(
     path: str | Path, dataset: Mapping[str, Any] | None = None, station: str | int | None = None,
     unit: str | None = None,
 ) -> Viewed:  # fmt: skip
@@ -146,7 +146,7 @@ def open_viewed(
     predictor = predictor.in_levels(unit)
     site = predictor.site
     data = None if data is None else aligned(data, site)
-    names, missing = answering(predictor, None if station is None else [station], key="station")
+    names, missing = choose_stations(predictor, None if station is None else [station], key="station")
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)

@@ -19,7 +19,7 @@ import torch
 
 import gsparc
 from gsparc.apps.export.compiled import make
-from gsparc.apps.export.compiled.blob import CHECKED, HEAD, Form, packed
+from gsparc.apps.export.compiled.blob import CHECKED, HEAD, Form, pack_form
 from gsparc.commands import export
 from gsparc.commands.train import train
 from gsparc.data.assemble import FARTHEST
@@ -111,9 +111,9 @@ def example():
 
 def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     predictor = of_powers(60)
-    found = make.compiled(predictor)
+    found = make.compile_model(predictor)
     assert (found.form.kind, found.error) == (4, 0) and found.summary == "a process of powers, exactly"
-    blob = packed(found.form, predictor.site.origin, found.error)
+    blob = pack_form(found.form, predictor.site.origin, found.error)
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
     assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
     assert checksum == zlib.crc32(blob[CHECKED:])
@@ -149,9 +149,9 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
     rx, csi = rng.uniform(size=(20, 3)), rng.normal(size=20) + 1j
     waves = gsparc.fit(rx=rx, tx=[3.0, 2, 1], csi=csi, frequency_hz=2.4e9, model="complex_gp")
     with pytest.raises(ValueError, match=r"^complex_gp: channels that are no sum of image sources [^\n]*$"):
-        make.compiled(waves)
+        make.compile_model(waves)
     with pytest.raises(ValueError, match=r"^gp: of spectra only rendered Gaussians can be compiled"):
-        make.compiled(of_images("gp"))
+        make.compile_model(of_images("gp"))
 
 
 MODELS = {
@@ -173,14 +173,14 @@ def test_the_library_answers_as_the_model(name, library, example, tmp_path, monk
     torch.set_num_threads(1)
     real = None if MODELS[name] else request.getfixturevalue("real_rfid")
     predictor = MODELS[name]() if MODELS[name] else of_a_real_array(real, tmp_path)
-    site, found = predictor.site, make.compiled(predictor)
+    site, found = predictor.site, make.compile_model(predictor)
     assert (found.error > 0) == ("distilled" in name), found.summary
     path = tmp_path / "field.gsparc"
-    path.write_bytes(packed(found.form, np.asarray(site.origin), found.error))
+    path.write_bytes(pack_form(found.form, np.asarray(site.origin), found.error))
     field, places = example.Field(path, library), make.random_places(site, PLACES, 3)
     answers = [field(place.astype(np.float64) + site.origin) for place in places]
     own = np.stack([one[0] for one in answers])
-    expected = make.answers(found.form.predictor or predictor, places).reshape(own.shape)
+    expected = make.ask_model(found.form.predictor or predictor, places).reshape(own.shape)
     assert field.facts.error == found.error
     scale = np.sqrt(np.mean(np.abs(expected) ** 2))
     assert np.abs(own - expected).max() < SCALE * scale
@@ -215,7 +215,7 @@ def files(folder, count, make_one, seed=0):
 @pytest.mark.slow
 def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_path):
     predictor = of_powers(100)
-    blob = packed(make.compiled(predictor).form, predictor.site.origin, 0.0)
+    blob = pack_form(make.compile_model(predictor).form, predictor.site.origin, 0.0)
     path = tmp_path / "field.gsparc"
     path.write_bytes(blob)
     run = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=300)
@@ -236,14 +236,14 @@ def test_sizes_whose_product_left_32_bits_were_written_beyond(library, example, 
     double = ("moving", "sources", "images", "combs", "offsets")
     arrays = {name: value.astype("f8" if name in double else "f4") for name, value in arrays.items()}
     form = Form(3, [*map(float, sizes), 1e9], arrays | {"middle": np.zeros(3)})
-    (path := tmp_path / "field.gsparc").write_bytes(packed(form, np.zeros(3)))
+    (path := tmp_path / "field.gsparc").write_bytes(pack_form(form, np.zeros(3)))
     with pytest.raises(ValueError, match="factors is missing"):
         example.Field(path, library)
     arrays = arrays | {"middle": np.zeros(3), "factors": np.ones(2 << 20, "f4")}
     sizes = [1, 1, 1, 1 << 20, 1, 1]
     fits = {name: np.resize(arrays[name], count) for name, count in field_files.needed(3, sizes).items()}
     fits |= {"middle": np.zeros(3), "combs": np.array([1e9, 1e6, 1e5])}
-    path.write_bytes(packed(Form(3, [*map(float, sizes), 1e9], fits), np.zeros(3)))
+    path.write_bytes(pack_form(Form(3, [*map(float, sizes), 1e9], fits), np.zeros(3)))
     with pytest.raises(ValueError, match="an answer of 209715200000 numbers"):
         example.Field(path, library)
 
@@ -252,7 +252,7 @@ def test_sizes_whose_product_left_32_bits_were_written_beyond(library, example, 
 def test_places_that_python_refuses_were_answered_by_the_library(library, example, tmp_path):
     predictor = of_powers(60)
     path = tmp_path / "field.gsparc"
-    path.write_bytes(packed(make.compiled(predictor).form, predictor.site.origin))
+    path.write_bytes(pack_form(make.compile_model(predictor).form, predictor.site.origin))
     field = example.Field(path, library)
     for place in ([FARTHEST * 1.01, 0, 0], [0, 0, -2 * FARTHEST], [0, np.nan, 0]):
         with pytest.raises(ValueError, match="status 1"):
@@ -269,10 +269,10 @@ def test_the_stated_error_missed_the_metres_under_a_station():
     rx = rng.uniform([0, 0, 0], [400, 400, 2], (300, 3))
     level = -40 - 20 * np.log10(np.linalg.norm(rx - tx, axis=1))
     predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
-    found = make.compiled(predictor, 1024)
+    found = make.compile_model(predictor, 1024)
     assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
     places = make.random_places(predictor.site, 6_000, 9)
-    own, whole = (make.answers(one, places)[:, 0] for one in (found.form.predictor, predictor))
+    own, whole = (make.ask_model(one, places)[:, 0] for one in (found.form.predictor, predictor))
     apart = 10 * np.log10(own / whole)
     assert found.error == pytest.approx(np.sqrt(np.mean(apart**2)), rel=0.1)
     assert found.worst > 0.7 * np.abs(apart).max()
@@ -289,11 +289,11 @@ def test_sanitizers_see_nothing(tmp_path, portable, capsys):
     library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON", f"-DGSPARC_PORTABLE={portable}")
     asked = driver(library, "-fsanitize=address,undefined", "-DGSPARC_WATCHED")
     models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4))
-    forms = [field_files.an_array(), *(make.compiled(predictor, 64).form for predictor in models)]
+    forms = [field_files.an_array(), *(make.compile_model(predictor, 64).form for predictor in models)]
     until, seed, slow, refused = time.monotonic() + FUZZ_S, 0, 0, 0
     while seed < 2 or time.monotonic() < until:
         for number, form in enumerate(forms):
-            (sound := tmp_path / "sound").write_bytes(packed(form, np.zeros(3)))
+            (sound := tmp_path / "sound").write_bytes(pack_form(form, np.zeros(3)))
             given = [sound, *files(tmp_path, 100, partial(field_files.mutated, form), (seed, number))]
             found = subprocess.run([asked, *given], capture_output=True, text=True, timeout=300)
             slow += found.returncode == -signal.SIGALRM

@@ -25,7 +25,7 @@ from gsparc.models import checkpoint
 
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
-from gsparc.apps.export.serving import RAW, Limits, Server, application
+from gsparc.apps.export.serving import RAW, Limits, Server, build_application
 
 TX = np.array([3.0, 2, 2])
 HOSTILE, HOSTILE_S = (
@@ -47,7 +47,7 @@ def fitted(kind="rssi"):
 class Served:
     def __init__(self, predictor, token=None, **limits):
         limits = Limits(**{"most": 64, **limits})
-        app = application(predictor, limits, token)
+        app = build_application(predictor, limits, token)
         self.server = Server(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -271,7 +271,7 @@ def test_numbers_of_an_answer_are_limited_and_large_ones_come_in_pieces(spectra)
         raw = np.frombuffer(served.post(places[:30].tobytes(), RAW)[1], "<f4")
         np.testing.assert_allclose(raw.reshape(30, 18, 36), expected, rtol=1e-4, atol=1e-6)
     with pytest.raises(ValueError, match="numbers=600: one place's answer holds 648"):
-        application(spectra, Limits(numbers=600), None)
+        build_application(spectra, Limits(numbers=600), None)
 
 
 def test_few_places_do_not_wait_for_many(powers, monkeypatch):

@@ -14,9 +14,9 @@ from doors import knock
 
 from gsparc import load
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
-from gsparc.apps.link.channels import truth
+from gsparc.apps.link.channels import true_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
-from gsparc.apps.link.study import beam_facts, crossing, gain, loss_db, rate_facts, transmit
+from gsparc.apps.link.study import beam_facts, beam_gain, beam_loss_db, find_crossing, rate_facts, send_blocks
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
@@ -85,11 +85,11 @@ def test_grid_is_sionna_s_order() -> None:
 def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
     draw = drawn()
     true = draw(200, 16, 4)
-    assert torch.allclose(gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
-    assert loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
+    assert torch.allclose(beam_gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
+    assert beam_loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
     noise = draw(200, 16, 4)
     # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
-    assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
+    assert abs(float(beam_loss_db(true, true + noise).mean()) - 3.0) < 0.3
 
 
 def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
@@ -117,8 +117,8 @@ def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
 
 
 def test_crossing_and_intervals() -> None:
-    assert np.isclose(crossing(pd.Series([1.0, 0.1, 0.01])), 1.0)
-    assert crossing(pd.Series([1.0, 0.5, 0.2])) is None
+    assert np.isclose(find_crossing(pd.Series([1.0, 0.1, 0.01])), 1.0)
+    assert find_crossing(pd.Series([1.0, 0.5, 0.2])) is None
     low, high = binomial_interval(10, 100)
     assert low < 0.1 < high and binomial_interval(0, 10)[0] == 0 and binomial_interval(10, 10)[1] == 1
     assert binomial_interval(0, 0) == (0, 1)
@@ -128,7 +128,7 @@ def test_truth_of_the_streets_is_in_the_snapshot_s_own_frame() -> None:
     """Recomputed rays, turned by offsets found on the uplink, equal the measured downlink up to its noise."""
     data = city("all")
     rows = fold().test
-    exact, source = truth(data, rows, data.site.subcarriers_hz)
+    exact, source = true_channels(data, rows, data.site.subcarriers_hz)
     miss = (exact - data.targets(rows)).abs().square().mean((1, 2))
     power = exact.abs().square().mean((1, 2))
     # Noise, and the tones a frequency offset leaks into one another.
@@ -145,7 +145,7 @@ def test_export_on_any_grid(trained) -> None:
     assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
     tones = predictor.csi(uplink=heard)
     assert tones.shape == (2, 64, 26)
-    exact, _ = truth(data, rows, wanted)
+    exact, _ = true_channels(data, rows, wanted)
     miss = np.abs(slot[:, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
     assert miss.mean() < 0.3 * np.mean(np.abs(exact.numpy() * data.site.target_scale) ** 2)
     found = predictor.paths(heard)
@@ -167,7 +167,7 @@ def test_a_coarse_look_may_be_all_there_is() -> None:
 
     nothing = Band(*[torch.zeros(5, 1)] * 3)
     for fine, blocks in ((8, 8), (20, 20)):
-        found = transmit(Half(), nothing, [1.0], (8, fine, 4))
+        found = send_blocks(Half(), nothing, [1.0], (8, fine, 4))
         assert len(found) == 2 * blocks
 
 

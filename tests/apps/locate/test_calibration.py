@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from gsparc.apps.locate import calibration
-from gsparc.apps.locate.calibration import calibrated
-from gsparc.apps.locate.cells import cover
-from gsparc.apps.locate.likelihood import Trust, of_levels
-from gsparc.apps.locate.search import Looked
+from gsparc.apps.locate.calibration import calibrate_trust
+from gsparc.apps.locate.cells import cover_box
+from gsparc.apps.locate.likelihood import Trust, level_misfit
+from gsparc.apps.locate.search import Search
 
 STATIONS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
 CORNERS = np.array([[0.0, 0, 0], [10.0, 10, 0]])
@@ -30,7 +30,8 @@ def snapshots(count, rng, wrong):
 def looked(values, cells):
     mean = torch.from_numpy(levels(cells.centre))
     return [
-        Looked(cells, of_levels(one[None], mean, torch.ones_like(mean))) for one in torch.from_numpy(values)
+        Search(cells, level_misfit(one[None], mean, torch.ones_like(mean)))
+        for one in torch.from_numpy(values)
     ]
 
 
@@ -38,13 +39,13 @@ def looked(values, cells):
 def test_areas_hold_the_promised_share(monkeypatch):
     monkeypatch.setattr(calibration, "LOOKS", 50)  # whatever trust is found, its level holds the share
     rng = np.random.default_rng(0)
-    cells = cover(CORNERS, 400, False)
+    cells = cover_box(CORNERS, 400, False)
     (places, values), (others, tested) = (snapshots(count, rng, 3.0) for count in (150, 400))
-    trust = calibrated(looked(values, cells), places, 0.9, Trust())
+    trust = calibrate_trust(looked(values, cells), places, 0.9, Trust())
     field = replace(Trust(1.0, 1.0, 100.0), level=0.9)
     seen = list(zip(looked(tested, cells), others, strict=True))
     held, believed = (
-        [one.by(how).level(place) <= how.level for one, place in seen] for how in (trust, field)
+        [one.posterior(how).level(place) <= how.level for one, place in seen] for how in (trust, field)
     )
     assert 0.84 < np.mean(held) < 0.96, "within two deviations of 150 and 400 drawn places"
     assert np.mean(believed) < 0.7, "as the field itself says they would not"
@@ -52,6 +53,6 @@ def test_areas_hold_the_promised_share(monkeypatch):
 
 def test_few_places_promise_the_whole_area():
     rng = np.random.default_rng(1)
-    cells = cover(CORNERS, 100, False)
+    cells = cover_box(CORNERS, 100, False)
     places, values = snapshots(5, rng, 3.0)
-    assert calibrated(looked(values, cells), places, 0.9, Trust()).level == 1.0
+    assert calibrate_trust(looked(values, cells), places, 0.9, Trust()).level == 1.0

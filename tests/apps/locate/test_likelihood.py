@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.apps.locate.likelihood import Trust, of_channels, of_levels, of_spectra
+from gsparc.apps.locate.likelihood import Trust, channel_misfit, level_misfit, spectrum_misfit
 
 RNG = np.random.default_rng(0)
 
@@ -15,7 +15,7 @@ def drawn(*shape: int) -> torch.Tensor:
 
 def test_unknown_offset_is_integrated_out():
     values, mean, variance, offset = drawn(3, 5), drawn(4, 5), drawn(4, 5).exp(), 2.0
-    found = of_levels(values, mean, variance, offset)
+    found = level_misfit(values, mean, variance, offset)
     for i in range(3):
         for j in range(4):
             dense = torch.diag(variance[j]) + offset**2
@@ -28,7 +28,7 @@ def test_unknown_offset_is_integrated_out():
 
 def test_device_offset_moves_no_place():
     values, mean, variance = drawn(2, 30), drawn(6, 30), torch.ones(6, 30).double()
-    one, other = (of_levels(v, mean, variance, 100.0).squared for v in (values, values + 7.0))
+    one, other = (level_misfit(v, mean, variance, 100.0).squared for v in (values, values + 7.0))
     assert torch.allclose(one - one[:, :1], other - other[:, :1], atol=0.1)
 
 
@@ -37,8 +37,8 @@ def test_missing_stations_change_nothing():
     values[:, 1] = torch.nan
     fewer = [0, 2, 3]
     some, without = (
-        of_levels(values, mean, variance),
-        of_levels(values[:, fewer], mean[:, fewer], variance[:, fewer]),
+        level_misfit(values, mean, variance),
+        level_misfit(values[:, fewer], mean[:, fewer], variance[:, fewer]),
     )
     assert torch.allclose(some.squared, without.squared) and torch.allclose(some.size, without.size)
     assert some.count.tolist() == [3.0, 3.0]
@@ -47,7 +47,7 @@ def test_missing_stations_change_nothing():
 def test_silence_favours_places_of_weak_signals():
     values = torch.full((1, 1), torch.nan).double()
     mean, variance = torch.tensor([[-100.0], [-60.0]]).double(), torch.full((2, 1), 9.0).double()
-    found = of_levels(values, mean, variance, 0.0, torch.full((1, 1), -90.0).double())
+    found = level_misfit(values, mean, variance, 0.0, torch.full((1, 1), -90.0).double())
     assert found.silent[0, 0] > -0.01 and found.silent[0, 1] < -20
     assert found.squared.abs().max() == 0 and found.count.item() == 0
 
@@ -56,14 +56,14 @@ def test_silence_favours_places_of_weak_signals():
 def test_unknown_phase_is_removed(known):
     mean = torch.complex(drawn(4, 6), drawn(4, 6))
     values = mean[1:2] * np.exp(1.3j)
-    found = of_channels(values, mean, torch.ones(4, 6).double(), known).squared[0]
+    found = channel_misfit(values, mean, torch.ones(4, 6).double(), known).squared[0]
     assert int(found.argmin()) == 1 or known
     assert (found[1] < 1e-9) != known
 
 
 def test_spectra_are_compared_pixel_by_pixel():
     values, mean, variance = drawn(3, 50), drawn(4, 50), drawn(4, 1).exp()
-    found = of_spectra(values, mean, variance).squared
+    found = spectrum_misfit(values, mean, variance).squared
     expected = ((values[:, None] - mean) ** 2).sum(2) / variance[:, 0]
     assert torch.allclose(found, expected, rtol=1e-9)
 
@@ -71,6 +71,6 @@ def test_spectra_are_compared_pixel_by_pixel():
 def test_heavy_tail_forgives_a_bad_snapshot():
     values, mean = torch.full((1, 20), 8.0).double(), torch.zeros(2, 20).double()
     mean[1] = 1.0
-    found = of_levels(values, mean, torch.ones(2, 20).double())
+    found = level_misfit(values, mean, torch.ones(2, 20).double())
     light, heavy = (Trust(1.0, 1.0, tail).log_likelihood(found)[0] for tail in (1e6, 2.0))
     assert light[1] - light[0] > 100 and 0 < heavy[1] - heavy[0] < 10

@@ -5,8 +5,8 @@ import pytest
 import torch
 from releases import real
 
-from gsparc.apps.locate.fingerprints import as_snapshots
-from gsparc.apps.locate.neighbours import PLAIN, features, located_by
+from gsparc.apps.locate.fingerprints import fingerprint_snapshots
+from gsparc.apps.locate.neighbours import PLAIN, feature_vectors, locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
 from gsparc.data.datasets.fingerprints import parted, read_fingerprints
 
@@ -30,29 +30,30 @@ def heard(values, places):
 @pytest.mark.parametrize("name", PLAIN)
 def test_a_hall_is_learned_also_from_two_rows(name):
     known, asked = hall(300, 0), hall(100, 1)
-    place, each_ms, fit_s = located_by(name, known, asked)
+    place, each_ms, fit_s = locate_by_neighbours(name, known, asked)
     assert np.median(np.linalg.norm(place - asked.place, axis=1)) < 1.2 and each_ms > 0 and fit_s > 0
-    assert np.isfinite(located_by(name, known.at(np.arange(2)), asked)[0]).all()
+    assert np.isfinite(locate_by_neighbours(name, known.at(np.arange(2)), asked)[0]).all()
     silent = heard(np.full((4, 8), np.nan), known.place[:4])
     with pytest.raises(ValueError, match="no row that could be learned from holds a value"):
-        located_by(name, silent, asked)
+        locate_by_neighbours(name, silent, asked)
 
 
 def test_silence_tells_rooms_apart():
     known = heard(np.array([[-50, np.nan], [-50, -60.0]] * 4), np.array([[0.0, 0, 0], [9.0, 0, 0]] * 4))
-    np.testing.assert_allclose(located_by("nearest", known, known)[0], known.place)
+    np.testing.assert_allclose(locate_by_neighbours("nearest", known, known)[0], known.place)
 
 
 def test_a_phase_of_a_whole_channel_is_no_feature():
     values = np.exp(1j * np.arange(6.0)).reshape(2, 3)
     places = np.zeros((2, 3))
-    turned = features(heard(values * np.exp(0.7j), places))
-    np.testing.assert_allclose(turned, features(heard(values, places)), atol=1e-12)
+    turned = feature_vectors(heard(values * np.exp(0.7j), places))
+    np.testing.assert_allclose(turned, feature_vectors(heard(values, places)), atol=1e-12)
 
 
 def test_weighted_neighbours_do_as_published_on_a_floor():
     """1.5 m is known of five neighbours."""
     rows = read_fingerprints(real("locate/wifine-floor4.npz"))
     train, test = parted(rows, "walks", share=0.25)
-    place, *_ = located_by("weighted_knn", *(as_snapshots(rows.at(part)) for part in (train, test)))
+    known, heard = (fingerprint_snapshots(rows.at(part)) for part in (train, test))
+    place, *_ = locate_by_neighbours("weighted_knn", known, heard)
     assert 0.9 < np.median(np.linalg.norm(place - rows.position[test], axis=1)) < 1.6

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.apps.locate.cells import cover
+from gsparc.apps.locate.cells import cover_box
 from gsparc.apps.locate.posterior import Posterior
 
 PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
@@ -16,13 +16,13 @@ def gaussians(cells, middles, width=0.2):
 
 
 def test_cells_cover_the_plane_that_was_walked():
-    cells = cover(PLACES, 400, False)
+    cells = cover_box(PLACES, 400, False)
     assert 300 < len(cells) < 600 and (cells.edge[:, 2] == 0).all() and (cells.centre[:, 2] == 1.5).all()
     assert cells.size.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
 
 
 def test_halves_fill_the_whole():
-    cells = cover(PLACES, 50, False)
+    cells = cover_box(PLACES, 50, False)
     finer = cells.halved()
     assert len(finer) == 4 * len(cells) and finer.size.sum() == pytest.approx(cells.size.sum())
     one = cells.at(np.array([3])).halved()
@@ -32,21 +32,21 @@ def test_halves_fill_the_whole():
 def test_cells_near_trained_places():
     walked = PLACES[PLACES[:, 0] < 1.0]
     both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
-    around = cover(both, 400, True)
-    assert len(around) < 0.5 * len(cover(both, 400, False))
+    around = cover_box(both, 400, True)
+    assert len(around) < 0.5 * len(cover_box(both, 400, False))
     with pytest.raises(ValueError, match="single place"):
-        cover(np.ones((5, 3)), 100, False)
+        cover_box(np.ones((5, 3)), 100, False)
 
 
 def test_cells_where_a_plan_is_open():
-    left = cover(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
+    left = cover_box(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
     assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
     with pytest.raises(ValueError, match="stand nowhere"):
-        cover(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
+        cover_box(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
 
 
 def test_peak_is_between_middles_of_cells():
-    cells = cover(PLACES, 400, False)
+    cells = cover_box(PLACES, 400, False)
     truth = np.array([2.037, 1.021])
     found = Posterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
     cell = cells.centre[found.log_density.argmax()]
@@ -56,23 +56,23 @@ def test_peak_is_between_middles_of_cells():
 
 @pytest.mark.slow
 def test_errors_of_recorded_places_widen_an_area():
-    cells = cover(PLACES, 8_000, False)
+    cells = cover_box(PLACES, 8_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])
     wide = Posterior(cells, sharp.sharp, 0.3)
     area = cells.size[wide.within(0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
     place = np.array([2.3, 1.1, 1.5])
-    assert wide.at(place) == pytest.approx(wide.log_density[cells.holding(place)], abs=0.05)
+    assert wide.at(place) == pytest.approx(wide.log_density[cells.index_of(place)], abs=0.05)
 
 
 def test_area_of_a_known_density_holds_its_share():
-    found = gaussians(cover(PLACES, 20_000, False), [[2.0, 1.0]])
+    found = gaussians(cover_box(PLACES, 20_000, False), [[2.0, 1.0]])
     area = found.cells.size[found.within(0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * 0.2**2 * np.log(0.1), rel=0.02)
     assert found.level(np.array([2.0, 1.0, 1.5])) < 0.01 and found.level(np.array([3.9, 1.9, 1.5])) > 0.99
 
 
 def test_two_places_alike_are_two_modes():
-    cells = cover(PLACES, 5_000, False)
+    cells = cover_box(PLACES, 5_000, False)
     assert len(gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).modes(0.9)) == 2
     assert len(gaussians(cells, [[0.8, 1.0]], 0.1).modes(0.9)) == 1

@@ -10,9 +10,9 @@ from PIL import Image
 from towns import town_model
 
 import gsparc
-from gsparc.apps.maps import map_of
-from gsparc.apps.maps.area import grid_of
-from gsparc.apps.maps.floor_plan import read_plan
+from gsparc.apps.maps import predict_map
+from gsparc.apps.maps.area import lay_grid
+from gsparc.apps.maps.floor_plan import read_floor_plan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
@@ -31,14 +31,14 @@ def image(path):
 
 
 def test_a_rectangle_is_covered_by_square_cells():
-    grid = grid_of(None, [0, 0, 4, 3], 1.5, 0.5)
+    grid = lay_grid(None, [0, 0, 4, 3], 1.5, 0.5)
     assert grid.shape == (6, 8) and grid.inside.all() and grid.extent == (0.0, 4.0, 0.0, 3.0)
     assert grid.places().shape == (48, 3) and (grid.places()[:, 2] == 1.5).all()
     assert grid.places(np.array([8]))[0].tolist() == [0.25, 0.75, 1.5]
 
 
 def test_a_polygon_keeps_its_holes(tmp_path):
-    grid = grid_of(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
+    grid = lay_grid(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
     assert grid.inside.sum() == 400 - 16
     assert not grid.inside[9, 9] and grid.inside[0, 0]
 
@@ -52,11 +52,11 @@ def test_degrees_are_those_of_the_model(tmp_path):
 
 
 def test_a_plan_lies_where_its_two_points_say(tmp_path):
-    plan = read_plan(image(tmp_path / "p.png"), [[0, 100, 5, 1], [200, 100, 25, 1]])  # 10 pixels a metre
+    plan = read_floor_plan(image(tmp_path / "p.png"), [[0, 100, 5, 1], [200, 100, 25, 1]])  # 10 a metre
     assert np.allclose(plan.corners(), [[5, 11], [25, 11], [25, 1], [5, 1]])
-    turned = read_plan(tmp_path / "p.png", [[0, 0, 0, 0], [100, 0, 0, 10]])  # its right is north
+    turned = read_floor_plan(tmp_path / "p.png", [[0, 0, 0, 0], [100, 0, 0, 10]])  # its right is north
     assert np.allclose(turned.corners()[1], [0, 20]) and np.allclose(turned.corners()[3], [10, 0])
-    grid = grid_of(None, None, 1.5, 1.0, plan)
+    grid = lay_grid(None, None, 1.5, 1.0, plan)
     assert grid.inside.sum() == 200
 
 
@@ -81,7 +81,7 @@ def refused(said, call, *given, **how):
     ("height_m=nan", {"height_m": float("nan")}),
 ])  # fmt: skip
 def test_spoilt_grids(said, how):
-    refused(said, grid_of, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
+    refused(said, lay_grid, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
 
 
 @pytest.mark.parametrize("said, content", [
@@ -97,7 +97,7 @@ def test_spoilt_grids(said, how):
 def test_spoilt_polygons(tmp_path, said, content):
     path = tmp_path / "a.geojson"
     path.write_text(content)
-    refused(said, grid_of, None, str(path), 1.5, 0.5)
+    refused(said, lay_grid, None, str(path), 1.5, 0.5)
 
 
 @pytest.mark.parametrize("said, points, content", [
@@ -115,7 +115,7 @@ def test_spoilt_plans(tmp_path, said, points, content):
         path.unlink()
     if content:
         path.write_text(content)
-    refused(said, read_plan, path, points)
+    refused(said, read_floor_plan, path, points)
 
 
 def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
@@ -128,7 +128,7 @@ def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
             file.write(struct.pack(">I", len(content)) + kind + content)
             file.write(struct.pack(">I", zlib.crc32(kind + content)))
     said = r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
-    refused(said, read_plan, tmp_path / "p.png", None)
+    refused(said, read_floor_plan, tmp_path / "p.png", None)
 
 
 @pytest.mark.parametrize("said, how", [
@@ -140,4 +140,4 @@ def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
     ("stood still", {"other_end": [0, 0, 1]}),
 ])  # fmt: skip
 def test_spoilt_maps(said, how):
-    refused(said, map_of, gsparc.load(town_model()), **{"step_m": 5.0, **how})
+    refused(said, predict_map, gsparc.load(town_model()), **{"step_m": 5.0, **how})

@@ -8,9 +8,9 @@ import pytest
 from towns import town_model
 
 import gsparc
-from gsparc.apps.maps import map_of
-from gsparc.apps.maps.field_map import geotiff_wanted, write_geotiff
-from gsparc.apps.maps.planning import plan_next
+from gsparc.apps.maps import predict_map
+from gsparc.apps.maps.field_map import check_geotiff, write_geotiff
+from gsparc.apps.maps.planning import plan_measurements
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 
@@ -21,7 +21,7 @@ def test_read_back_at_the_right_place(tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
     from rasterio.warp import transform
 
-    found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
+    found = predict_map(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         assert file.descriptions[0] == "power_db" and file.count == 11
@@ -34,7 +34,7 @@ def test_read_back_at_the_right_place(tmp_path):
             expected = ORIGIN.to_degrees(place)
             assert np.allclose([latitude[0], longitude[0]], np.ravel(expected), atol=1e-7)
             (value,) = next(file.sample([(x, y)], indexes=1))
-            assert value == pytest.approx(found.strongest(found.power_db)[row, column])
+            assert value == pytest.approx(found.at_best_server(found.power_db)[row, column])
 
 
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
@@ -51,13 +51,13 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
                for ring in rings]  # fmt: skip
     drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
-    found = map_of(predictor, tmp_path / "area.geojson", step_m=1.0)
+    found = predict_map(predictor, tmp_path / "area.geojson", step_m=1.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         power = file.read(1)
         outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
     assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
-    np.testing.assert_array_equal(np.flipud(power), found.strongest(found.power_db))
+    np.testing.assert_array_equal(np.flipud(power), found.at_best_server(found.power_db))
 
 
 def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
@@ -65,24 +65,24 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     predictor = gsparc.load(town_model())
     with pytest.raises(DataError, match="degrees mean nothing to"):
-        map_of(predictor, tmp_path / "area.geojson")
+        predict_map(predictor, tmp_path / "area.geojson")
     with pytest.raises(DataError, match="degrees mean nothing to"):
-        plan_next(predictor, 3, walkable=tmp_path / "area.geojson")
+        plan_measurements(predictor, 3, walkable=tmp_path / "area.geojson")
     with pytest.raises(DataError, match="a rectangle is in metres"):
-        map_of(predictor, [11.3, 47.2, 11.301, 47.2008])
+        predict_map(predictor, [11.3, 47.2, 11.301, 47.2008])
 
 
 def test_a_map_in_metres_has_no_projection(tmp_path):
     rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
-    found = map_of(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
+    found = predict_map(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
     write_geotiff(tmp_path / "map.tif", found, None)
     with rasterio.open(tmp_path / "map.tif") as file:
         (value,) = next(file.sample([(found.grid.x[3], found.grid.y[5])], indexes=1))
-        assert file.crs is None and value == pytest.approx(found.strongest(found.power_db)[5, 3])
+        assert file.crs is None and value == pytest.approx(found.at_best_server(found.power_db)[5, 3])
 
 
 def test_asked_for_without_rasterio(monkeypatch):
     monkeypatch.setattr("gsparc.apps.maps.field_map.find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs rasterio"):
-        geotiff_wanted(True)
-    assert not geotiff_wanted(None) and not geotiff_wanted(False)
+        check_geotiff(True)
+    assert not check_geotiff(None) and not check_geotiff(False)

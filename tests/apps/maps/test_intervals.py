@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from gsparc.apps.maps.intervals import LEAST_ROWS, Evidence, calibrate, covered, cross_validated, distances
+from gsparc.apps.maps.intervals import (
+    LEAST_ROWS,
+    Evidence,
+    calibrate,
+    cross_validate,
+    interval_coverage,
+    nearest_distances,
+)
 
 
 def evidence(count=3000, seed=0, heavy=False, stations=1):
@@ -25,17 +32,17 @@ def evidence(count=3000, seed=0, heavy=False, stations=1):
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.9])
 def test_as_many_lie_inside_as_promised(heavy, share):
     learned, fresh = evidence(heavy=heavy), evidence(seed=1, heavy=heavy)
-    inside, width = covered(calibrate(learned, share), fresh)
+    inside, width = interval_coverage(calibrate(learned, share), fresh)
     assert abs(inside[np.isfinite(width)].mean() - share) < 0.03
-    assert abs(cross_validated(learned, share).share - share) < 0.03
+    assert abs(cross_validate(learned, share).share - share) < 0.03
 
 
 def test_width_rises_with_distance_and_ends():
     found = calibrate(evidence())
     far = np.linspace(0, found.reach, 50)
-    half = found.interval(np.full(50, 2.0), far, np.zeros(50, int))
+    half = found.half_width(np.full(50, 2.0), far, np.zeros(50, int))
     assert np.isfinite(half).all() and half[-1] > 1.2 * half[0]
-    assert np.isnan(found.interval(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
+    assert np.isnan(found.half_width(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
     assert np.isnan(found.expected_error(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
 
 
@@ -48,7 +55,7 @@ def test_the_model_without_any_sense_of_distance_still_gets_wider():
 
 def test_each_station_holds_its_own_share():
     known, fresh = evidence(stations=3), evidence(seed=1, stations=3)
-    inside, _ = covered(calibrate(known), fresh)
+    inside, _ = interval_coverage(calibrate(known), fresh)
     shares = [inside[fresh.station == t].mean() for t in range(3)]
     assert max(shares) - min(shares) < 0.08
     assert calibrate(known).station[2] > 1.5 * calibrate(known).station[0]
@@ -59,7 +66,7 @@ def test_outage_follows_the_errors_and_not_a_bell():
     found = calibrate(known)
     expected = found.expected_error(known.spread_db, known.distance, known.station)
     for below in (-75.0, -71.0, -65.0):
-        said = np.nanmean(found.below(below, known.mean_db, expected))
+        said = np.nanmean(found.probability_below(below, known.mean_db, expected))
         assert abs(said - np.mean(known.level_db < below)) < 0.03
 
 
@@ -73,9 +80,9 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
     censored = Evidence(**{**vars(known), **parts})
     found, whole = calibrate(censored), calibrate(known)
     assert found.tail is None and found.half.mean() == pytest.approx(whole.half.mean(), rel=0.1)
-    inside, width = covered(found, fresh)
+    inside, width = interval_coverage(found, fresh)
     assert abs(inside[np.isfinite(width)].mean() - 0.9) < 0.03
-    said = cross_validated(censored, 0.9)
+    said = cross_validate(censored, 0.9)
     assert all(abs(part - 0.9) < 0.04 for part in (said.share, said.heard_share, said.silent_share))
 
 
@@ -87,4 +94,4 @@ def test_too_little_evidence_promises_nothing():
 def test_distance_is_to_rows_of_the_same_station():
     known, station = np.array([[0.0, 0, 0], [10, 0, 0]]), np.array([0, 1])
     places = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]
+    assert nearest_distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]

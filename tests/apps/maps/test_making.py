@@ -13,13 +13,21 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.apps.maps.field_map import ARRAYS, REFUSED, best_server, loads, overlapping, server_chance, sinr
+from gsparc.apps.maps.field_map import (
+    ARRAYS,
+    REFUSED,
+    best_server,
+    count_overlap,
+    read_loads,
+    server_chance,
+    sinr,
+)
 from gsparc.apps.maps.intervals import Evidence
-from gsparc.apps.maps.making import _usual, answering, levels_at, map_of
-from gsparc.apps.maps.pictures import Layer, Legend, layers, named_areas, shades
+from gsparc.apps.maps.making import _usual_levels, choose_stations, predict_levels, predict_map
+from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
 from gsparc.apps.maps.promise import Promise
-from gsparc.apps.maps.promised import notes_of
-from gsparc.apps.maps.refining import refined
+from gsparc.apps.maps.promised import map_notes
+from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
@@ -34,7 +42,7 @@ def predictor():
 
 
 def test_cells_hold_what_the_model_predicts(predictor):
-    found = map_of(predictor, [0, 0, 80, 60], step_m=4.0, threshold_db=-90)
+    found = predict_map(predictor, [0, 0, 80, 60], step_m=4.0, threshold_db=-90)
     assert found.power_db.shape == (2, 15, 20) and found.power_db.dtype == np.float32
     place = [found.grid.x[3], found.grid.y[5], 1.5]
     for number, name in enumerate(found.stations):
@@ -51,38 +59,38 @@ def test_a_unit_of_maps_changed_their_names_alone():
     """`unit=dBm` of levels in dBW wrote dBm beside the same numbers and the threshold of the others."""
     stored = gsparc.load(town_model())
     predictor = Predictor(stored.method, replace(stored.site, level_unit="dBW"), extra=stored.extra)
-    own = map_of(predictor, step_m=8.0, threshold_db=-90, noise_db=-100)
-    other = map_of(predictor, step_m=8.0, threshold_db=-60, noise_db=-70, unit="dBm")
+    own = predict_map(predictor, step_m=8.0, threshold_db=-90, noise_db=-100)
+    other = predict_map(predictor, step_m=8.0, threshold_db=-60, noise_db=-70, unit="dBm")
     assert (own.unit, other.unit, other.threshold_db) == ("dBW", "dBm", -60)
     for name in ("power_db", "lower_db", "upper_db"):
         np.testing.assert_allclose(getattr(other, name), getattr(own, name) + 30, atol=1e-4)
     for name in ("expected_error_db", "outage", "sinr_db", "server_chance", "best_server"):
         np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
-    assert "[dBm]" in next(iter(layers(other))).legend.label
+    assert "[dBm]" in next(iter(list_layers(other))).legend.label
     assert other.figures()["map/unit"] == "dBm"
     with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
-        map_of(predictor, unit="W")
+        predict_map(predictor, unit="W")
 
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):
-    whole = map_of(predictor, step_m=5.0)
+    whole = predict_map(predictor, step_m=5.0)
     monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 7)
     monkeypatch.setattr("gsparc.apps.maps.making.BANDS", 13)
-    assert np.allclose(map_of(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
+    assert np.allclose(predict_map(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
 def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
     def slow(*given):
         time.sleep(0.05)
-        return levels_at(*given)
+        return predict_levels(*given)
 
-    monkeypatch.setattr("gsparc.apps.maps.making.levels_at", slow)
+    monkeypatch.setattr("gsparc.apps.maps.making.predict_levels", slow)
     monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 20)
     began = time.perf_counter()
     signal.signal(signal.SIGALRM, signal.default_int_handler)
     signal.setitimer(signal.ITIMER_REAL, 0.2)
     with pytest.raises(KeyboardInterrupt):
-        map_of(predictor, step_m=1.0)
+        predict_map(predictor, step_m=1.0)
     assert time.perf_counter() - began < 2
 
 
@@ -90,19 +98,19 @@ def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
 @pytest.mark.parametrize("engine", ["joblib", "ray"])
 def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
     torch.set_num_threads(1)
-    here = map_of(predictor, step_m=1.0)
+    here = predict_map(predictor, step_m=1.0)
     elsewhere(engine)
-    there = map_of(predictor, step_m=1.0)
+    there = predict_map(predictor, step_m=1.0)
     for name in ("power_db", "lower_db", "upper_db", "best_server", "outage"):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
 
 
 def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
-    found = map_of(predictor, step_m=10.0, stations=["east", 0])
-    both = map_of(predictor, step_m=10.0)
+    found = predict_map(predictor, step_m=10.0, stations=["east", 0])
+    both = predict_map(predictor, step_m=10.0)
     assert found.stations == ("east", "west")
     assert np.array_equal(found.power_db[::-1], both.power_db)
-    assert map_of(predictor, step_m=10.0, stations=["east"]).power_db.shape[0] == 1
+    assert predict_map(predictor, step_m=10.0, stations=["east"]).power_db.shape[0] == 1
 
 
 def test_ratio_of_signal_to_interference_by_hand():
@@ -113,25 +121,21 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert sinr(power, np.ones(2), -80.0)[1] == pytest.approx(20)
     assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
     assert best_server(power).tolist() == [0, 1, REFUSED]
-    assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+    assert read_loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
 
 
 def test_ratio_and_overlap_are_within_one_carrier():
     power = np.array([[-50.0, -90.0], [-52.0, -60.0], [-54.0, -61.0], [-57.0, np.nan]])
     carrier = np.array([0, 1, 0, 0])
-    assert overlapping(power, carrier).tolist() == [2, 1] and overlapping(power, carrier * 0).tolist() == [
-        3,
-        2,
-    ]
-    found = sinr(power, np.ones(4), None, carrier)
-    assert found[0] == pytest.approx(-50 - 10 * np.log10(10**-5.4 + 10**-5.7)) and np.isnan(found[1])
+    assert count_overlap(power, carrier).tolist() == [2, 1]
+    assert count_overlap(power, carrier * 0).tolist() == [3, 2]
 
 
 def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
     stations = replace(predictor.site.stations, carrier_hz=np.array([8e8, 2.6e9]))
     monkeypatch.setattr(predictor, "site", replace(predictor.site, stations=stations))
-    found = map_of(predictor, step_m=10.0)
-    drawn = {layer.name: layer.values for layer in layers(found)}
+    found = predict_map(predictor, step_m=10.0)
+    drawn = {layer.name: layer.values for layer in list_layers(found)}
     for number, band in enumerate(("800 MHz", "2600 MHz")):
         np.testing.assert_array_equal(drawn[f"power {band}"], found.power_db[number])
         assert (drawn[f"best_server {band}"] == 0).all()
@@ -158,7 +162,7 @@ def test_the_chance_of_a_best_server_was_a_product_of_all_that_it_beats():
 def test_twenty_one_stations_had_twenty_colours():
     """Those of neighbours were shades of one hue: areas side by side have different ones, and names."""
     classes = np.kron(np.arange(24.0).reshape(4, 6), np.ones((6, 6)))
-    found = shades(classes, 24)
+    found = assign_colours(classes, 24)
     assert found.min() >= 0 and found.max() < 10
     grid = found[classes.astype(int)]
     assert (grid[6:][::6] != grid[:-6][::6]).all() and (grid[:, 6:] != grid[:, :-6]).all()
@@ -167,10 +171,10 @@ def test_twenty_one_stations_had_twenty_colours():
     assert len(table) == 24 and len(np.unique(table, axis=0)) <= 10
     layer = Layer("best_server", classes, Legend("", -0.5, 23.5), words, group=np.arange(24) // 3)
     hue = [rgb_to_hsv(to_rgb(colour))[0] for colour in layer.table()]
-    listed = layer.listed()
+    listed = layer.class_table()
     assert np.ptp(np.reshape(hue, (8, 3)), axis=1).max() < 0.02 and len(set(listed["colour"])) == 24
     assert sum(listed["share"]) == pytest.approx(1, abs=2e-3) and listed["station"][0] == "cell 0"
-    named = list(named_areas(classes, words))
+    named = list(label_places(classes, words))
     assert [word for _, _, word in named] == list(words)
     assert all(classes[row, column] == words.index(word) for row, column, word in named)
 
@@ -183,23 +187,24 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     usual = np.array([[-80.0, 5.0], [-50.0, 5.0]])  # the second is unknown in the last cell, mostly louder
     told = server_chance(power, error, usual, np.array([-60.0, -100.0]))
     assert told[0] == pytest.approx(0.5, abs=1e-4) and told[3] == pytest.approx(0.0756, abs=2e-3)
-    quiet = map_of(predictor, step_m=10.0)
-    loud = map_of(predictor, step_m=10.0, noise_db=0.0)
+    quiet = predict_map(predictor, step_m=10.0)
+    loud = predict_map(predictor, step_m=10.0, noise_db=0.0)
     assert not quiet.unsure.any() and loud.unsure.all() and loud.figures()["map/server_unsure"] == 1
-    unsure = {layer.name: layer.unsure for layer in layers(loud)}
+    unsure = {layer.name: layer.unsure for layer in list_layers(loud)}
     assert unsure["best_server"] is not None and unsure["power"] is None
 
 
 def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
     level, row = np.append(np.linspace(-100, -50, 101), [-90.0, -70.0]), np.arange(103)
     evidence = Evidence(level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100)
-    usual, floor = _usual(Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0), [0, 1], None)
+    promise = Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0)
+    usual, floor = _usual_levels(promise, [0, 1], None)
     assert floor == pytest.approx([-99.5, -90]) and usual[0] == pytest.approx([-75, 14.58], abs=0.01)
-    assert _usual(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
+    assert _usual_levels(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
 
 
 def test_saved_whole(predictor, tmp_path):
-    made = map_of(predictor, [0, 0, 80, 60], step_m=8.0)
+    made = predict_map(predictor, [0, 0, 80, 60], step_m=8.0)
     made.save(tmp_path / "map.npz")
     with np.load(tmp_path / "map.npz") as found:
         for name in ARRAYS:
@@ -211,7 +216,7 @@ def test_saved_whole(predictor, tmp_path):
 def test_spectra_have_no_power(predictor, monkeypatch):
     monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
     with pytest.raises(DataError, match="no received power"):
-        map_of(predictor)
+        predict_map(predictor)
 
 
 def test_interpolated_cells_are_as_exact_as_asked_for():
@@ -224,11 +229,11 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
 
     inside = np.ones((150, 200), bool)
     inside[100:, :60] = False
-    every, count = refined(ask, inside, 1, 0.1)
-    few, asked = refined(ask, inside, 4, 0.1)
+    every, count = sample_adaptively(ask, inside, 1, 0.1)
+    few, asked = sample_adaptively(ask, inside, 4, 0.1)
     assert count == inside.sum() and asked < 0.2 * count
     assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.1
-    exact, asked = refined(ask, inside, 4, 1e-6)
+    exact, asked = sample_adaptively(ask, inside, 4, 1e-6)
     assert asked > 0.9 * count and np.nanmax(np.abs(exact - every)) < 1e-4
 
 
@@ -236,7 +241,7 @@ def test_channels_have_a_power(tmp_path):
     data = load_own(channels(tmp_path / "own.npz"))
     method, rows = method_class("image_source_gp")(), np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, budget_s=1.0))
-    found = map_of(Predictor(method, data.site), step_m=0.5, height_m=1.2)
+    found = predict_map(Predictor(method, data.site), step_m=0.5, height_m=1.2)
     assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
     assert (found.expected_error_db > 0).all() and not found.extra
     near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
@@ -247,15 +252,15 @@ def test_channels_have_a_power(tmp_path):
 def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
     nothing = Evidence(*(np.zeros(0) for _ in range(7)))
     promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
-    names, notes = answering(predictor, None, promise)
+    names, notes = choose_stations(predictor, None, promise)
     assert names == ["west"] and "east was never heard" in notes[0]
     with pytest.raises(DataError, match="never heard"):
-        answering(predictor, ["east"], promise)
+        choose_stations(predictor, ["east"], promise)
 
 
 def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(predictor, monkeypatch):
     monkeypatch.setitem(vars(predictor.site.stations), "label", ("Roof 1", "Tower"))
-    found = map_of(predictor, step_m=8.0, stations=["east", "west"])
+    found = predict_map(predictor, step_m=8.0, stations=["east", "west"])
     assert found.stations == ("Tower", "Roof 1")
     # What was measured is in dB, of what nobody said: the map says how it is called dBm.
-    assert any("unit=dBm" in note for note in notes_of(found, None))
+    assert any("unit=dBm" in note for note in map_notes(found, None))

@@ -8,7 +8,7 @@ import pytest
 from towns import MASTS, town_file, town_model
 
 import gsparc
-from gsparc.apps.maps.placing import Antenna, NewStation, assumption, new_station_error, place_next
+from gsparc.apps.maps.placing import Antenna, NewStationError, assumption, new_station_error, place_station
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
@@ -31,7 +31,7 @@ def together(tmp_path_factory):
 
 def test_the_best_place_is_far_from_those_that_serve(together):
     predictor = gsparc.load(together[2])
-    found = place_next(predictor, threshold_db=-75.0, count=60, error=NewStation(3.0, 1.0, 4))
+    found = place_station(predictor, threshold_db=-75.0, count=60, error=NewStationError(3.0, 1.0, 4))
     apart = np.linalg.norm(found.places[0, :2] - MASTS[:, :2], axis=1)
     assert apart.min() > 20 and found.coverage[0] > found.before
     assert (found.low <= found.coverage + 0.05).all() and (found.coverage <= found.high + 0.05).all()
@@ -41,14 +41,14 @@ def test_the_best_place_is_far_from_those_that_serve(together):
 def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
     (tmp_path / "roofs.csv").write_text("x,y,z\n5,5,20\n75,5,12\n")
     predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "sites": tmp_path / "roofs.csv"}
-    found = place_next(predictor, **how)
+    found = place_station(predictor, **how)
     assert sorted(found.places.tolist()) == [[5, 5, 20], [75, 5, 12]]
-    louder = place_next(predictor, **how, antenna=Antenna(power_db=10))
+    louder = place_station(predictor, **how, antenna=Antenna(power_db=10))
     assert louder.coverage[0] > found.coverage[0] + 0.05
     with pytest.raises(DataError, match="knows no patterns"):
-        place_next(predictor, **how, antenna=Antenna(azimuth=[0, 120]))
+        place_station(predictor, **how, antenna=Antenna(azimuth=[0, 120]))
     with pytest.raises(DataError, match="degrees from north"):
-        place_next(predictor, **how, antenna=Antenna(azimuth="north"))
+        place_station(predictor, **how, antenna=Antenna(azimuth="north"))
 
 
 def test_two_stations_leave_none_out(together):
@@ -67,7 +67,7 @@ def test_two_stations_leave_none_out(together):
 def test_spoilt_wishes(together, said, how):
     model = together[2] if how else town_model()  # whose stations are known ones alone
     with pytest.raises(DataError, match=said) as caught:
-        place_next(gsparc.load(model), threshold_db=-75.0, **how)
+        place_station(gsparc.load(model), threshold_db=-75.0, **how)
     assert "\n" not in str(caught.value)
 
 

@@ -10,7 +10,7 @@ from towns import town_model
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance
 from gsparc.apps.maps.intervals import Evidence
-from gsparc.apps.maps.planning import plan_next
+from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
@@ -29,13 +29,13 @@ def test_gains_are_what_conditioning_takes_away():
     gains, before = one.gains(every), one.variances().sum()
     for place in range(6):
         twin = ErrorCovariance(one.covariance.copy(), 0.3, np.ones(6))
-        twin.measured(place)
+        twin.condition_on(place)
         assert before - twin.variances().sum() == pytest.approx(gains[place])
 
 
 def test_error_falls_and_places_lie_where_data_do_not(predictor):
     area = [-40, 0, 80, 60]  # nobody was west of 0
-    found = plan_next(predictor, 8, area)
+    found = plan_measurements(predictor, 8, area)
     assert len(found.places) == 8 and found.after_db < found.before_db
     assert (np.diff(found.expected_db) < 0).all() and (found.places[:, 0] < 5).mean() > 0.7
     random = np.median(found.error_before)
@@ -43,7 +43,7 @@ def test_error_falls_and_places_lie_where_data_do_not(predictor):
 
 
 def test_a_first_design_spreads_over_the_floor():
-    found = plan_next(None, 9, [0, 0, 30, 30])
+    found = plan_measurements(None, 9, [0, 0, 30, 30])
     apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1) + 99 * np.eye(9)
     assert apart.min() > 5 and found.after_db < 0.8 * found.before_db
 
@@ -51,18 +51,18 @@ def test_a_first_design_spreads_over_the_floor():
 def test_corridors_and_a_length(tmp_path, predictor):
     lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
     (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
-    found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5])
-    assert len(found.path) and not len(plan_next(predictor, 2).path)
+    found = plan_measurements(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5])
+    assert len(found.path) and not len(plan_measurements(predictor, 2).path)
     on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
     assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
-    short = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
+    short = plan_measurements(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
     assert short.length_m <= 30 and len(short.places) >= 1
 
 
 def test_it_stops_where_a_place_gains_too_little(predictor):
-    found = plan_next(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
+    found = plan_measurements(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
     assert 0 < len(found.places) < 50 and "less than 0.1 dB" in found.stopped
-    assert len(plan_next(predictor, 50, least_gain_db=50).places) == 0
+    assert len(plan_measurements(predictor, 50, least_gain_db=50).places) == 0
 
 
 def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predictor):
@@ -71,17 +71,17 @@ def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predi
     evidence = Evidence(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
     known = np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)]) - predictor.site.origin
     promise = Promise(evidence, known, np.arange(120) % 2, 5.0)
-    found = plan_next(predictor, 6, promise=promise)
+    found = plan_measurements(predictor, 6, promise=promise)
     reach = promise.calibration().reach
     assert cKDTree(known + predictor.site.origin).query(found.at)[0].max() <= reach + found.grid.step < 10
     assert found.places[:, 0].max() < 50 and not found.grid.inside[:, -1].any()
-    assert plan_next(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
+    assert plan_measurements(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
 
 
 def test_a_long_walk_for_nothing_was_not_called_so(predictor):
-    found = plan_next(predictor, 1, route=True)
+    found = plan_measurements(predictor, 1, route=True)
     assert "hardly worth it: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
-    assert not plan_next(None, 9, [0, 0, 30, 30]).in_vain
+    assert not plan_measurements(None, 9, [0, 0, 30, 30]).in_vain
 
 
 def test_a_walk_is_not_longer_than_it_must_be():
@@ -102,7 +102,7 @@ def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
     assert ways.length[0, 1] == pytest.approx(50 + 40 + 40)
     assert ways.length[3, 1] == pytest.approx(5 + 130)  # from beside the street
     assert ways.length[0, 2] == pytest.approx(200) and not ways.along[0, 2]  # streets that do not meet
-    path = ways.through(np.array([0, 1]))
+    path = ways.path_through(np.array([0, 1]))
     assert [50, 0] in path.tolist() and [50, 40] in path.tolist()
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(130)
 
@@ -118,4 +118,4 @@ def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
 ])  # fmt: skip
 def test_spoilt_wishes(how, said):
     with pytest.raises(DataError, match=said):
-        plan_next(None, **{"area": [0, 0, 9, 9], **how})
+        plan_measurements(None, **{"area": [0, 0, 9, 9], **how})

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.promise import PromiseSettings, gather, predict_rows
+from gsparc.apps.maps.promise import PromiseSettings, gather_promise, predict_rows
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
@@ -38,10 +38,10 @@ def test_intervals_of_thirty_towns_hold_a_measurement_as_often_as_promised_and_t
         method, context = GaussianProcess(), FitContext(seed=seed)
         method.fit(data, fold, context)
         learned = Learned(method, GaussianProcess, data, fold, context)
-        promise = gather(learned, PromiseSettings(seed=seed))
+        promise = gather_promise(learned, PromiseSettings(seed=seed))
         mean, spread = predict_rows(method, data, fold.test)
         far = promise.distance(data.moving[fold.test], 0)
-        half = promise.calibration(SHARE).interval(spread, far, np.zeros(len(far), int))
+        half = promise.calibration(SHARE).half_width(spread, far, np.zeros(len(far), int))
         missed = (np.abs(one[fold.test] - mean) for one in (level, field))
         found = np.column_stack([far, *(miss <= half for miss in missed), np.full(len(far), seed % 2)])
         parts.append(found[np.isfinite(half)])
@@ -62,5 +62,5 @@ def test_a_map_of_sixty_rows_was_refused():
     fold, context = Fold(every, every[:0], every[:0]), FitContext()
     method = GaussianProcess()
     method.fit(data, fold, context)
-    promise = gather(Learned(method, GaussianProcess, data, fold, context), PromiseSettings())
+    promise = gather_promise(Learned(method, GaussianProcess, data, fold, context), PromiseSettings())
     assert len(promise.evidence) >= 100 and promise.coverage(SHARE).share > 0.8

@@ -8,8 +8,8 @@ import pytest
 from campaigns import brief, compose, spectra
 from towns import town_model
 
-from gsparc.apps.view.site_view import SiteView, grid_for
-from gsparc.apps.view.viewed import open_viewed
+from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.viewed import open_model
 from gsparc.commands.train import train
 
 
@@ -24,11 +24,11 @@ def rendered() -> Path:
 @pytest.fixture
 def spectrum_view() -> SiteView:
     """A model of spectra."""
-    return SiteView(open_viewed(rendered()))
+    return SiteView(open_model(rendered()))
 
 
 @pytest.fixture
 def power_view() -> SiteView:
     """A model of powers of two stations."""
-    viewed = open_viewed(town_model())
-    return SiteView(viewed, grid=grid_for(viewed, {"area": [0, 0, 80, 60], "step_m": 2.0}))
+    viewed = open_model(town_model())
+    return SiteView(viewed, grid=plane_grid(viewed, {"area": [0, 0, 80, 60], "step_m": 2.0}))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gsparc.apps.view.answer import Answer, Rays, ask, rays
-from gsparc.apps.view.building import BOX, MIRROR, rays_of
-from gsparc.apps.view.reasons import answer_markdown, legend_html, reasons
+from gsparc.apps.view.answer import Answer, Rays, merge_paths, predict_answer
+from gsparc.apps.view.building import BOX, MIRROR, ray_parts
+from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html
 from gsparc.apps.view.scene import Faces
 
 HERE = np.zeros(3)
@@ -14,25 +14,25 @@ HERE = np.zeros(3)
 
 def test_how_far_the_other_end_and_measurements_are():
     answer = Answer({"rx": np.array([10.0, 0, 0]), "tx": np.array([-10.0, 0, 0])}, level_db=-75.0)
-    said = reasons(answer, "rx", cKDTree([[10.0, 3, 0], [0, 0, 0]]))
+    said = explain_level(answer, "rx", cKDTree([[10.0, 3, 0], [0, 0, 0]]))
     assert said == ["20 m from the other end", "nearest measurement: 3 m away"]
 
 
 def test_a_fade_is_said_to_be_one():
     paths = Rays(np.array([-40.0, -40.5]), np.array([10.0, 20]), None)
-    said = " | ".join(reasons(Answer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None))
+    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None))
     assert "they cancel each other: 22.8 dB less than their powers" in said
-    said = " | ".join(reasons(Answer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None))
+    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None))
     assert "their powers" not in said
 
 
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
-    spectrum = ask(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
+    spectrum = predict_answer(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None
     assert set(spectrum.ends) == {"tx", "rx"}
     name = power_view.viewed.stations[1]
     asked, at = power_view.viewed.predictor_of(name), power_view.starts(name)
-    power = ask(asked, at)
+    power = predict_answer(asked, at)
     assert power.level_db == pytest.approx(float(asked.rssi(**at)[0]), abs=1e-3)
     assert power.spread_db > 0 and power.spectrum is None
 
@@ -41,16 +41,18 @@ def test_a_path_that_two_searches_found_is_one_path():
     """Their direct paths were two, each 6 dB too weak, that "add up"."""
     one, other = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
     gain = np.array([[0.05j, 0.01, 0.05j, 1e-9]])
-    found = rays(gain, np.array([5.0, 9.0, 5.1, 9.0]), np.array([one, other, [0.9999, 0.01, 0.01], one]))
+    found = merge_paths(
+        gain, np.array([5.0, 9.0, 5.1, 9.0]), np.array([one, other, [0.9999, 0.01, 0.01], one])
+    )
     np.testing.assert_allclose(found.gain_db, [-20, -40])
     np.testing.assert_array_equal(found.delay_ns, [5.0, 9.0])
-    assert len(rays(gain, np.array([5.0, 9.0, 5.1, 9.0]), None).gain_db) == 3
+    assert len(merge_paths(gain, np.array([5.0, 9.0, 5.1, 9.0]), None).gain_db) == 3
 
 
 def test_rays_are_as_long_as_their_delays():
     towards = np.array([[1.0, 0, 0], [0, 1, 0]])
     rays = Rays(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
-    lines, ends = rays_of(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
+    lines, ends = ray_parts(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)

@@ -7,9 +7,9 @@ import pytest
 from campaigns import compose
 from towns import town_model
 
-from gsparc.apps.maps.making import levels_at
-from gsparc.apps.view.building import GAUSSIANS, build
-from gsparc.apps.view.viewed import open_viewed
+from gsparc.apps.maps.making import predict_levels
+from gsparc.apps.view.building import GAUSSIANS, build_scene
+from gsparc.apps.view.viewed import open_model
 from gsparc.commands import view as command
 from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
@@ -54,9 +54,9 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
 
 
 def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
-    viewed = open_viewed(town_model(), {"file": str(tmp_path / "gone.npz")})
+    viewed = open_model(town_model(), {"file": str(tmp_path / "gone.npz")})
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
-    scene = build(viewed, None, "west", viewed.measured("west"))
+    scene = build_scene(viewed, None, "west", viewed.measured("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
 
 
@@ -64,7 +64,7 @@ def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):
     read = checkpoint.read
     monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
     given = compose("ckpt=x", config="view").unit
-    viewed = open_viewed(town_model(), {"file": "gone.npz"}, "west", given)
+    viewed = open_model(town_model(), {"file": "gone.npz"}, "west", given)
     assert viewed.site.level_unit == "dBm"
 
 
@@ -72,13 +72,13 @@ def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
     """`unit=dBW` of levels in dBm wrote dBW beside the same numbers."""
     read, places = checkpoint.read, np.array([[20.0, 30, 1.5], [50, 10, 1.5]])
     monkeypatch.setattr(checkpoint, "read", lambda path: in_dbm(read(path)))
-    dbm, dbw = (open_viewed(town_model(), unit=unit) for unit in (None, "dBW"))
+    dbm, dbw = (open_model(town_model(), unit=unit) for unit in (None, "dBW"))
     assert (dbm.site.level_unit, dbw.site.level_unit) == ("dBm", "dBW")
-    level, lower = (levels_at(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
+    level, lower = (predict_levels(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
     np.testing.assert_allclose(lower, level - 30, atol=1e-4)
     np.testing.assert_allclose(dbw.measured("west").values, dbm.measured("west").values - 30, atol=1e-4)
     with pytest.raises(ValueError, match=r"unit=mW: of powers in dBm expected dBm, dBW$"):
-        open_viewed(town_model(), unit="mW")
+        open_model(town_model(), unit="mW")
 
 
 def in_dbm(stored):

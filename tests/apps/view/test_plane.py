@@ -7,31 +7,31 @@ from campaigns import channels
 from towns import trained
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.answer import ask
-from gsparc.apps.view.plane import refining, sheet, weakest
-from gsparc.apps.view.site_view import grid_for
-from gsparc.apps.view.viewed import open_viewed
+from gsparc.apps.view.answer import predict_answer
+from gsparc.apps.view.plane import plane_sheet, refine_plane, weakest_place
+from gsparc.apps.view.site_view import plane_grid
+from gsparc.apps.view.viewed import open_model
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     name, grid = power_view.viewed.stations[0], power_view.grid
     asked = power_view.viewed.predictor_of(name)
-    planes = [plane for plane in refining(asked, grid) if plane is not None]
+    planes = [plane for plane in refine_plane(asked, grid) if plane is not None]
     assert [plane.stride for plane in planes] == [2, 1]
     assert all(np.isfinite(plane.level_db).all() for plane in planes)
     direct = asked.rssi(rx=grid.places()).reshape(grid.shape)
     np.testing.assert_allclose(planes[-1].level_db, direct, atol=1e-4)
-    first = weakest(planes[-1])
+    first = weakest_place(planes[-1])
     np.testing.assert_array_equal(first, grid.places()[direct.argmin()])
-    second = weakest(planes[-1], [first])
+    second = weakest_place(planes[-1], [first])
     assert np.linalg.norm(second - first) >= 0.1 * max(grid.shape) * grid.step
-    assert weakest(planes[-1], grid.places()) is None
+    assert weakest_place(planes[-1], grid.places()) is None
 
 
 def test_a_lifted_plane_is_asked_at_its_height(power_view):
     asked = power_view.viewed.predictor_of(power_view.viewed.stations[0])
     high = replace(power_view.grid, height=6.0)
-    *_, plane = refining(asked, high)
+    *_, plane = refine_plane(asked, high)
     assert (high.places()[:, 2] == 6.0).all()
     direct = asked.rssi(rx=high.places()).reshape(high.shape)
     np.testing.assert_allclose(plane.level_db, direct, atol=1e-4)
@@ -42,7 +42,7 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     values = np.zeros(grid.shape)
     values[0, 0] = np.nan  # south-west
     dot = power_view.station("west").dot
-    made = sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)  # so that dots are seen whole
+    made = plane_sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)  # so that dots are seen whole
     assert made.image[-1, 0, 3] == 0 and (made.image[:-1, :, 3] > 0).all()
     left, _, _, high = grid.extent
     assert dot > 0
@@ -52,8 +52,8 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
 
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
     """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
-    viewed = open_viewed(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
-    *_, plane = refining(viewed.predictor_of(None), grid_for(viewed, {"step_m": 0.5}))
-    said = [ask(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
+    viewed = open_model(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
+    *_, plane = refine_plane(viewed.predictor_of(None), plane_grid(viewed, {"step_m": 0.5}))
+    said = [predict_answer(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
     assert any(one.response is not None and one.spread_db > 2 for one in said)
     np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)

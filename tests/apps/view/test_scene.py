@@ -4,21 +4,21 @@ import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.building import build
+from gsparc.apps.view.building import build_scene
 from gsparc.apps.view.scene import EXTENT, Frame
 
 
 def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
     places = np.array([[4.5e6, 5.1e5, 0], [4.5e6 + 2000, 5.1e5 + 900, 30]])
     frame = Frame.around(places)
-    drawn = frame.drawn(places)
+    drawn = frame.to_drawn(places)
     assert drawn.dtype == np.float32 and np.ptp(drawn, axis=0).max() == EXTENT
-    np.testing.assert_allclose(frame.world(drawn), places, atol=1e-3)
+    np.testing.assert_allclose(frame.to_world(drawn), places, atol=1e-3)
 
 
 def test_one_place_is_a_site_too():
     frame = Frame.around(np.zeros((1, 3)))
-    assert np.isfinite(frame.drawn(np.ones((2, 3)))).all()
+    assert np.isfinite(frame.to_drawn(np.ones((2, 3)))).all()
 
 
 def test_values_that_are_not_known_are_grey():
@@ -34,7 +34,7 @@ def test_a_floor_plan_and_the_grid_lie_beneath_the_plane(power_view):
     """The plan lay at the height of the plane: of each other half was hidden."""
     viewed, plan = power_view.viewed, FloorPlan(np.zeros((60, 80, 3), np.uint8), 1 + 0j, 60j)
     low = viewed.heights()[0]
-    scene = build(viewed, plan, "west", None)
+    scene = build_scene(viewed, plan, "west", None)
     assert scene.ground < scene.part("floor plan").corner[2] < low <= power_view.grid.height
 
 

@@ -14,8 +14,8 @@ import pytest
 from campaigns import spectra
 from towns import trained
 
-from gsparc.apps.view.site_view import SiteView, grid_for
-from gsparc.apps.view.viewed import open_viewed
+from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.viewed import open_model
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
-from gsparc.apps.view.server.page import page  # noqa: E402
+from gsparc.apps.view.server.page import render_page  # noqa: E402
 from gsparc.apps.view.server.serve import Server  # noqa: E402
 from gsparc.apps.view.server.session import Session  # noqa: E402
 
@@ -90,14 +90,14 @@ class Visitor:
                 pass
 
     def drag(self, place):
-        at = tuple(float(value) for value in self.session.scene.frame.drawn(np.asarray(place)))
+        at = tuple(float(value) for value in self.session.scene.frame.to_drawn(np.asarray(place)))
         fields = {"name": "/rx", "wxyz": (1.0, 0, 0, 0), "position": at, "owner": str(self.number)}
         self.say("TransformControlsUpdateMessage", **fields)
 
 
 def drag(session, end, place):
     """As viser calls it while a handle is dragged."""
-    session.gizmos[end].position = session.scene.frame.drawn(np.asarray(place))
+    session.gizmos[end].position = session.scene.frame.to_drawn(np.asarray(place))
     asyncio.run(session._dragged(end)(SimpleNamespace(target=session.gizmos[end])))
 
 
@@ -126,10 +126,10 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
 
 
 def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
-    session = visit(SiteView(open_viewed(trained(spectra(tmp_path / "rx.npz", moving="rx"), "idw"))))
+    session = visit(SiteView(open_model(trained(spectra(tmp_path / "rx.npz", moving="rx"), "idw"))))
     drag(session, "rx", [0.2, 0.1, -0.3])
     settle(session)
-    where = session.scene.frame.world(session.nodes["sphere"].position)
+    where = session.scene.frame.to_world(session.nodes["sphere"].position)
     np.testing.assert_allclose(where, [0.2, 0.1, -0.3], atol=1e-5)
 
 
@@ -140,8 +140,8 @@ def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
     power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
     file = tmp_path / "both.npz"
     np.savez(file, tx_position=ends[0], rx_position=ends[1], rssi_db=power, carrier_hz=1e9)
-    viewed = open_viewed(trained(file, "idw"))
-    session = visit(SiteView(viewed, grid=grid_for(viewed, {"step_m": 2.0})))
+    viewed = open_model(trained(file, "idw"))
+    session = visit(SiteView(viewed, grid=plane_grid(viewed, {"step_m": 2.0})))
     settle(session)
     before = session.plane.level_db
     drag(session, "rx", [1.0, 1.0, 1.0])
@@ -228,17 +228,17 @@ def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
 
 
 def test_a_page_showed_one_of_several_stations(power_view):
-    text = page(power_view, steps=8)
+    text = render_page(power_view, steps=8)
     assert "nothing is computed here" in text and text.rstrip().endswith("</html>") and len(text) > 500_000
     assert "for 2 of 2 stations (west, east), one after another" in text and "plays 8 recorded places" in text
     assert "west: measured received power" in text and "east: measured received power" in text
-    assert "for 1 of 2 stations (west); station=NAME shows another" in page(power_view, steps=2)
+    assert "for 1 of 2 stations (west); station=NAME shows another" in render_page(power_view, steps=2)
 
 
 @pytest.mark.slow
 def test_a_page_opens_from_its_file_and_asks_for_nothing(browser, tmp_path, spectrum_view):
     file = tmp_path / "page.html"
-    file.write_text(page(spectrum_view, steps=4), encoding="utf-8")
+    file.write_text(render_page(spectrum_view, steps=4), encoding="utf-8")
     browser.get(file.as_uri())
     assert "nothing is computed here" in browser.find_element("css selector", "details").text
     assert wait(lambda: browser.find_elements("css selector", "canvas"), 30)

@@ -14,7 +14,7 @@ PATHS = 25  # that a DeepMIMO scenario has at most
 DIRECT_M = 0.1  # a source so near the static end is that end
 
 
-def write(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, float]:
+def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tuple[int, float]:
     """Write a scenario: the static end is DeepMIMO's transmitter, places (n, 3) [m, world] are receivers.
 
     A source that is not the static end is given as one reflection, in the plane that mirrors the one into the

@@ -57,7 +57,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class Line:
+class TappedDelayLine:
     """Taps at instants so close that those between can be interpolated.
 
     The channel at f is the sum over l of `gain exp(-j 2 pi (f - carrier_hz) (first + l) / rate_hz)`.
@@ -86,7 +86,7 @@ class Line:
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
 
 
-def write_impulses(
+def write_taps(
     predictor: Predictor, way: Trajectory, settings: Mapping[str, Any], file: Path
 ) -> dict[str, Any]:
     """Write taps, delays and Doppler to `file`, an npz.
@@ -101,7 +101,7 @@ def write_impulses(
         Facts: `taps/*`; decibels of what taps leave of the channels.
     """
     site = predictor.site
-    line = fitted(predictor, way, settings["taps"], settings["rate_hz"], settings["antennas"])
+    line = fit_taps(predictor, way, settings["taps"], settings["rate_hz"], settings["antennas"])
     units = {"time_s": "s", f"{site.moving_end}_position": "m", "delay_s": "s", "doppler_hz": "Hz"}
     delay_s = (line.first + np.arange(line.gain.shape[2])) / line.rate_hz
     known = (line.time_s, way.at(line.time_s), delay_s, line.doppler_hz())
@@ -116,9 +116,9 @@ def write_impulses(
     }  # fmt: skip
 
 
-def fitted(
+def fit_taps(
     predictor: Predictor, way: Trajectory, taps: int, rate_hz: float | None = None, antennas: int = 1
-) -> Line:
+) -> TappedDelayLine:
     """Taps of a model's channels along a trajectory, by least squares over the band.
 
     Over the measured tones. The taps stand side by side, where most power arrives.
@@ -164,7 +164,7 @@ def fitted(
         at = places[int(np.argmin(total))].round(2).tolist()
         raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
     residual = float(error.sum() / total.sum()), float((error / total).max())
-    return Line(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
+    return TappedDelayLine(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
 
 
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:

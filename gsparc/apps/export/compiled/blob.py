@@ -36,7 +36,7 @@ class Form:
     predictor: Predictor | None = None
 
 
-def packed(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
+def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
     """Return the file's bytes; places are from `origin` (3,) [m], errors are those of `Compiled`."""
     numbers = np.array([form.kind, error, worst, *origin, *form.numbers], np.float64)
     arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
@@ -53,9 +53,9 @@ def packed(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.
     return HEAD.pack(MAGIC, VERSION, zlib.crc32(checked), at, len(arrays))[:CHECKED] + checked
 
 
-def write(path: Path, form: Form, origin: np.ndarray, error: float, worst: float) -> int:
-    """Write `packed` whole or not at all; returns its bytes."""
-    blob = packed(form, origin, error, worst)
+def write_form(path: Path, form: Form, origin: np.ndarray, error: float, worst: float) -> int:
+    """Write `pack_form` whole or not at all; returns its bytes."""
+    blob = pack_form(form, origin, error, worst)
     with whole_file(path) as partial:
         partial.write_bytes(blob)
     return len(blob)

@@ -34,7 +34,7 @@ ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made f
 
 
 @dataclass(frozen=True)
-class Compiled:
+class CompiledForm:
     """A form and how far it is from its model.
 
     Attributes:
@@ -56,7 +56,7 @@ NEAREST = 1e-3  # of the way to the other end: where the largest errors are look
 SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
-def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled:
+def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> CompiledForm:
     """Return the form of a model of one station, its error measured at `count` random places, and a quarter
     more near the other end, where powers are largest.
 
@@ -72,8 +72,8 @@ def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled
     # An exact form is not measured: its error is that of rounding to float32.
     exact = exact_form(method, site)
     if exact is not None:
-        return Compiled(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
-    form = distilled_form(predictor, seed)
+        return CompiledForm(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
+    form = distil_form(predictor, seed)
     assert form.predictor is not None
     # Other seeds than that of the places distilled from, or the error would be that of known places.
     near = near_places(site, max(1, count // 4), seed + 2)
@@ -84,12 +84,12 @@ def compiled(predictor: Predictor, count: int = 4096, seed: int = 0) -> Compiled
     found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
     error, worst = np.maximum(np.sqrt(found) if site.kind == "rssi" else found, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
-    return Compiled(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
+    return CompiledForm(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
 
 
 def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
     """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
-    own, whole = (answers(one, places).reshape(len(places), -1) for one in (form, model))
+    own, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
     if model.site.kind == "rssi":
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
@@ -133,7 +133,7 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
     return view_form(frozen) if isinstance(frozen, FrozenView) else None
 
 
-def distilled_form(predictor: Predictor, seed: int) -> Form:
+def distil_form(predictor: Predictor, seed: int) -> Form:
     """Return a form near a model: its array's part alone, or sources or a process of powers given its answers
     at random places.
 
@@ -151,7 +151,7 @@ def distilled_form(predictor: Predictor, seed: int) -> Form:
     if site.kind == "spectrum":
         raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
     sources = _sources_of(method) if site.kind == "csi" else None
-    data = answered(predictor, random_places(site, ANSWERED[site.kind], seed))
+    data = sample_model(predictor, random_places(site, ANSWERED[site.kind], seed))
     if sources is not None:
         return _sources_given(sources, data)
     every = np.arange(len(data))
@@ -206,27 +206,27 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
     return places
 
 
-def ends_at(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
+def split_ends(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
     """Local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
     places = places.astype(np.float64)
     return {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
 
 
-def answers(predictor: Predictor, places: np.ndarray) -> np.ndarray:
+def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
     site = predictor.site
-    parts = (ends_at(site, places[i : i + 64]) for i in range(0, len(places), 64))
+    parts = (split_ends(site, places[i : i + 64]) for i in range(0, len(places), 64))
     asked = [{end: at + site.origin for end, at in part.items()} for part in parts]
     return np.concatenate([predictor.linear(**ends).mean.numpy() for ends in asked])
 
 
-def answered(predictor: Predictor, places: np.ndarray) -> Measurements:
+def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:
     """Measurements whose targets are the model's answers at local places [m]."""
     site, count = predictor.site, len(places)
     still = np.zeros(3) if site.static_position is None else site.static_position
-    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | ends_at(site, places)
+    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | split_ends(site, places)
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     return Measurements(
         site, ends["tx"].astype(np.float64), ends["rx"].astype(np.float64),
-        np.broadcast_to(rotation, (count, 3, 3)), answers(predictor, places) / site.target_scale,
+        np.broadcast_to(rotation, (count, 3, 3)), ask_model(predictor, places) / site.target_scale,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gsparc.apps.export.compiled.blob import Form, packed
+from gsparc.apps.export.compiled.blob import Form, pack_form
 from gsparc.processes.nearest import JITTER, Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.posterior import Exact
@@ -29,7 +29,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     """
     if process.others:
         weights, alone = zip(*process.members, strict=True)
-        files = [packed(form, np.zeros(3)) for one in alone if (form := powers_form(one, scale))]
+        files = [pack_form(form, np.zeros(3)) for one in alone if (form := powers_form(one, scale))]
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         # As many as `kMost` of ops/csrc/field/mixture.h.
         fits = len(files) == len(weights) <= LANES

@@ -20,7 +20,7 @@ def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, A
     return {part.name: part.draw(api, scene.frame) for part in scene.parts}
 
 
-def floor(api: Any, scene: Scene) -> float:
+def draw_floor(api: Any, scene: Scene) -> float:
     """Draw a grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale
@@ -29,12 +29,12 @@ def floor(api: Any, scene: Scene) -> float:
     middle = np.array([*frame.middle[:2], scene.ground])
     api.add_grid(
         "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
-        section_size=5 * side * frame.scale, position=frame.drawn(middle), shadow_opacity=0.0,
+        section_size=5 * side * frame.scale, position=frame.to_drawn(middle), shadow_opacity=0.0,
     )  # fmt: skip
     return float(side)
 
 
-def first_view(camera: Any, aside: float = ASIDE, up: float = 0.0) -> None:
+def set_first_view(camera: Any, aside: float = ASIDE, up: float = 0.0) -> None:
     """Look at the site from the south and above, `aside` widths past its middle and `up` above it."""
     past = np.array([aside, 0.0, up])
     camera.position = tuple(EXTENT * (np.array(ABOVE) + past))

@@ -12,14 +12,14 @@ import numpy as np
 import viser
 
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.answer import ask
-from gsparc.apps.view.building import PATHS, SPHERE, rays_of
+from gsparc.apps.view.answer import predict_answer
+from gsparc.apps.view.building import PATHS, SPHERE, ray_parts
 from gsparc.apps.view.panel import panel_image
-from gsparc.apps.view.plane import sheet
+from gsparc.apps.view.plane import plane_sheet
 from gsparc.apps.view.reasons import ENDS, headline, legend_html
 from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
-from gsparc.apps.view.server.draw import draw_scene, first_view, floor
-from gsparc.apps.view.site_view import SiteView, walk
+from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
+from gsparc.apps.view.site_view import SiteView, walk_places
 
 STEPS = 24  # places of the walk, of all stations together
 LEAST = 4  # of each station
@@ -32,7 +32,7 @@ LIMITS = (
 )
 
 
-def page(view: SiteView, steps: int = STEPS) -> str:
+def render_page(view: SiteView, steps: int = STEPS) -> str:
     """Return the page as text; about 1 MB, most of it the viewer.
 
     Args:
@@ -53,9 +53,9 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     viewed, api = view.viewed, server.scene
     names = viewed.stations[: max(steps // LEAST, 1)]
     api.set_up_direction("+z")
-    first_view(server.initial_camera, 0.0, UP)
+    set_first_view(server.initial_camera, 0.0, UP)
     scene, moving = view.station(names[0]).scene, viewed.moving[-1]
-    side = floor(api, scene)
+    side = draw_floor(api, scene)
     nodes, legends = _still(api, view, names[0], {})
     recorder = server.get_scene_serializer()
     dot = api.add_icosphere("/end", radius=0.016 * EXTENT, color=(214, 39, 40))
@@ -66,11 +66,11 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             nodes, more = _still(api, view, name, nodes)
             legends += more
         sphere, extent = view.sphere(name), view.extent(name)
-        for place in walk(view, name, steps // len(names)):
-            answer = ask(viewed.predictor_of(name), {**view.starts(name), moving: place})
-            dot.position = scene.frame.drawn(place)
+        for place in walk_places(view, name, steps // len(names)):
+            answer = predict_answer(viewed.predictor_of(name), {**view.starts(name), moving: place})
+            dot.position = scene.frame.to_drawn(place)
             label.text = (f"{name}: " if len(names) > 1 else "") + headline(answer, view.unit)
-            parts: list[Part] = list(rays_of(answer, extent) or ())
+            parts: list[Part] = list(ray_parts(answer, extent) or ())
             legends += [PATHS] if parts else []
             if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
                 around = answer.ends["rx"] + sphere.offsets
@@ -102,7 +102,7 @@ def _still(
         plane = view.plane(name, view.grid)
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
-        level = sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
+        level = plane_sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
         nodes["plane"] = level.draw(api, scene.frame)
     if len(view.viewed.stations) > 1:
         legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]

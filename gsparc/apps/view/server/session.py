@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.answer import Answer, ask
-from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, rays_of
+from gsparc.apps.view.answer import Answer, predict_answer
+from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, ray_parts
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.panel import panel_image
-from gsparc.apps.view.plane import Plane, refining, sheet, weakest
-from gsparc.apps.view.reasons import ENDS, answer_markdown, legend_html, reasons
+from gsparc.apps.view.plane import Plane, plane_sheet, refine_plane, weakest_place
+from gsparc.apps.view.reasons import ENDS, answer_markdown, explain_level, legend_html
 from gsparc.apps.view.scene import EXTENT, Points
-from gsparc.apps.view.server.draw import draw_scene, first_view, floor
+from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView
 
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
@@ -45,7 +45,7 @@ class Session:
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
         self._draw_still()
-        first_view(client.camera)
+        set_first_view(client.camera)
         self._panel()
         self._add_gizmos()
         self.want_answer()
@@ -62,7 +62,7 @@ class Session:
         api = self.client.scene
         api.set_up_direction("+z")
         self.nodes = draw_scene(api, self.scene, self.nodes)
-        self.cell = floor(api, self.scene)
+        self.cell = draw_floor(api, self.scene)
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
             around = self.scene.frame.middle + self.sphere.offsets
             dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
@@ -72,7 +72,7 @@ class Session:
         for end, place in self.places.items():
             gizmo = self.client.scene.add_transform_controls(
                 f"/{end}", scale=0.2 * EXTENT, disable_rotations=True, depth_test=False,
-                position=self.scene.frame.drawn(place),
+                position=self.scene.frame.to_drawn(place),
             )  # fmt: skip
             self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
             above: Any = {"position": (0, 0, 0.03 * EXTENT), "anchor": "bottom-center"}
@@ -140,14 +140,14 @@ class Session:
 
     def _dragged(self, end: str) -> Any:
         async def moved(event: Any) -> None:
-            self.places[end] = self.scene.frame.world(event.target.position)
+            self.places[end] = self.scene.frame.to_world(event.target.position)
             self._moved(end)
 
         return moved
 
     def _move(self, end: str, position: ArrayLike) -> None:
         self.places[end] = place = np.asarray(position, np.float64)
-        self.gizmos[end].position = self.scene.frame.drawn(place)
+        self.gizmos[end].position = self.scene.frame.to_drawn(place)
         self._moved(end)
 
     def _moved(self, end: str) -> None:
@@ -159,10 +159,10 @@ class Session:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
         if where == WEAKEST and self.plane is not None:
-            weak_place = weakest(self.plane, self.visited)
+            weak_place = weakest_place(self.plane, self.visited)
             if weak_place is None:  # all were visited
                 self.visited.clear()
-                weak_place = weakest(self.plane)
+                weak_place = weakest_place(self.plane)
             if weak_place is not None:
                 self.visited.append(weak_place)
                 place = weak_place
@@ -208,7 +208,7 @@ class Session:
 
     def _answered(self) -> Iterator[None]:
         try:
-            answer = ask(self.view.viewed.predictor_of(self.station), dict(self.places))
+            answer = predict_answer(self.view.viewed.predictor_of(self.station), dict(self.places))
         except ValueError as error:
             self.answer_text.content = f"**{error}**"
             return
@@ -219,14 +219,14 @@ class Session:
         yield
 
     def _show(self, answer: Answer) -> None:
-        why = reasons(answer, self.view.viewed.moving[-1], self.one.tree)
-        rays, first = rays_of(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
+        why = explain_level(answer, self.view.viewed.moving[-1], self.one.tree)
+        rays, first = ray_parts(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
         with self.client.atomic():
             self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
             if answer.spectrum is not None and self.sphere is not None and "rx" in answer.ends:
-                self.nodes[SPHERE].position = self.scene.frame.drawn(answer.ends["rx"])
+                self.nodes[SPHERE].position = self.scene.frame.to_drawn(answer.ends["rx"])
                 self.nodes[SPHERE].colors = self.sphere.colours(answer.spectrum)
             for part in rays:
                 self.nodes[part.name] = part.draw(self.client.scene, self.scene.frame)
@@ -257,14 +257,14 @@ class Session:
         other = self.places["tx"].tolist() if self.site.static_end is None else None
         legend, begin = self.one.power, time.perf_counter()
         self.visited.clear()
-        for plane in refining(predictor, grid, other):
+        for plane in refine_plane(predictor, grid, other):
             if plane is None:
                 yield
                 continue
             first = self.power is None
             legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
             self.plane, self.power = plane, legend
-            part = sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2)
+            part = plane_sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2)
             self.nodes[PLANE] = part.draw(self.client.scene, self.scene.frame)
             if first:
                 self._legends()

@@ -36,7 +36,7 @@ PLACES = np.array([[110.0, 60, 1.5], [95.0, 41, 2.0]])
 @pytest.fixture
 def scenario(tmp_path):
     """By the names that DeepMIMO's loader makes: `{key}_t{set}_tx{index}_r{set}.npz`, one array called so."""
-    assert deepmimo.write(tmp_path, Mirror(), PLACES)[0] == 2
+    assert deepmimo.write_scenario(tmp_path, Mirror(), PLACES)[0] == 2
     names = [*"power phase delay aoa_az aoa_el aod_az aod_el inter inter_pos rx_pos tx_pos".split()]  # noqa: SIM905
     held = {name: np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in names}
     return json.loads((tmp_path / "params.json").read_text()), held
@@ -68,7 +68,7 @@ def test_places_in_utm_metres_were_rounded_to_half_a_metre(tmp_path, monkeypatch
     utm = np.array([447_000.25, 4_500_000.25, 0])
     monkeypatch.setattr(Site, "origin", Site.origin + utm)
     monkeypatch.setattr(Mirror, "paths", lambda self, rx, paths=Mirror.paths: paths(self, rx - utm))
-    deepmimo.write(tmp_path, Mirror(), PLACES + utm)
+    deepmimo.write_scenario(tmp_path, Mirror(), PLACES + utm)
     at, still, meets = (
         np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in ("rx_pos", "tx_pos", "inter_pos")
     )
@@ -96,7 +96,7 @@ def test_models_without_paths_are_refused(tmp_path):
             raise ValueError("paths: none")
 
     with pytest.raises(ValueError, match="paths: none"):
-        deepmimo.write(tmp_path, Waves(), PLACES)
+        deepmimo.write_scenario(tmp_path, Waves(), PLACES)
     assert not list(tmp_path.iterdir())
 
 
@@ -104,7 +104,7 @@ def test_the_package_of_that_name_reads_it(tmp_path, monkeypatch):
     package = pytest.importorskip("deepmimo", reason="deepmimo 4 is not installed")
     folder = tmp_path / "deepmimo_scenarios" / "mirror"
     folder.mkdir(parents=True)
-    deepmimo.write(folder, Mirror(), PLACES)
+    deepmimo.write_scenario(folder, Mirror(), PLACES)
     monkeypatch.chdir(tmp_path)
     how = package.ChannelParameters()
     how.bs_antenna.shape = np.array([1, 1])

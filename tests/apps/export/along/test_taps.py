@@ -7,7 +7,7 @@ from campaigns import compose
 from scipy.interpolate import CubicSpline
 
 import gsparc
-from gsparc.apps.export.along.taps import Trajectory, fitted
+from gsparc.apps.export.along.taps import Trajectory, fit_taps
 from gsparc.commands import export
 from gsparc.data.raw import read_raw
 from gsparc.data.schema import LIGHT
@@ -63,7 +63,7 @@ TONES = CARRIER + 240e3 * (np.arange(128) - 63.5)
 @pytest.mark.parametrize("with_paths", [False, True])
 def test_taps_sum_to_the_channel_at_any_time(with_paths):
     model, way = Rays(TONES, with_paths), drive()
-    line = fitted(model, way, 48, 38.4e6, 3)
+    line = fit_taps(model, way, 48, 38.4e6, 3)
     assert line.residual < 1e-3 and line.worst < 1e-2
     between = np.linspace(0.003, 0.497, 37)  # not instants
     tones = TONES[20:-20]
@@ -76,7 +76,7 @@ def test_taps_sum_to_the_channel_at_any_time(with_paths):
 
 def test_doppler_is_that_of_the_motion():
     model, way = Rays(TONES, True), drive()
-    line = fitted(model, way, 16, 38.4e6)
+    line = fit_taps(model, way, 16, 38.4e6)
     middle = way.at(np.array([0.25]))[0]
     towards = (model.sources - middle) / np.linalg.norm(model.sources - middle, axis=1)[:, None]
     expected = CARRIER / LIGHT * 10 * towards[0, 0]
@@ -85,7 +85,7 @@ def test_doppler_is_that_of_the_motion():
 
 
 def test_residual_is_stated_and_falls_with_taps():
-    found = [fitted(Rays(TONES), drive(length=0.1), taps).residual for taps in (1, 4, 8, 32)]
+    found = [fit_taps(Rays(TONES), drive(length=0.1), taps).residual for taps in (1, 4, 8, 32)]
     assert found[0] > found[1] > found[2] > found[3] and found[0] > 0.05
 
 
@@ -97,7 +97,7 @@ def test_residual_is_stated_and_falls_with_taps():
 ])  # fmt: skip
 def test_what_cannot_be_is_refused(said, tones, length, rate_hz):
     with pytest.raises(ValueError, match=said):
-        fitted(Rays(tones), drive(length=length), 4, rate_hz)
+        fit_taps(Rays(tones), drive(length=length), 4, rate_hz)
 
 
 def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch):
@@ -133,7 +133,7 @@ def test_a_link_over_exported_taps_is_the_link_study():
 
     tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
     ray, way = Rays(tones, True), drive()
-    line, begin = fitted(ray, way, 32, 30.72e6), np.random.default_rng(3).uniform(0, 1, 32) * 0.5
+    line, begin = fit_taps(ray, way, 32, 30.72e6), np.random.default_rng(3).uniform(0, 1, 32) * 0.5
     delay = (line.first + np.arange(32)) / line.rate_hz
     taps = CubicSpline(line.time_s, line.gain)(begin)[:, 0]  # still while a slot lasts
     summed = taps @ np.exp(-2j * np.pi * np.outer(delay, tones - CARRIER))
