@@ -65,10 +65,13 @@ def test_the_promise_stays_with_the_model(mapped, model):
 def test_a_plan_from_the_model(mapped, model, tmp_path):
     done = run("plan", f"ckpt={model}", "count=6", "route=true", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
-    assert any("6 places: expected error" in line and "a walk of" in line for line in done.out), done
+    assert any("6 places: expected error" in line and "a way of" in line for line in done.out), done
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
-    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 7 and (tmp_path / "plan.png").exists()
+    lines = (tmp_path / "plan.csv").read_text().splitlines()
+    assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
+    way = np.array(json.loads((tmp_path / "plan.geojson").read_text())["coordinates"])
+    assert np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(facts["plan/length_m"])
 
 
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
