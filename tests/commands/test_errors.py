@@ -47,7 +47,7 @@ REFUSED = [
     (PRINTS, "give dataset.file=FILE, and no ckpt"),
     (f"{HALL} ckpt={{spectra}}", "give dataset.file=FILE, and no ckpt"),
     (f"{PRINTS} dataset.file=none.npz", "none.npz: no such file"),
-    (f"{HALL} offset_db=3", "of trained models alone"),
+    (f"{HALL} offset_db=3", "for trained models alone"),
     (f"{HALL} data={{prints}}/others.npz", "no access point of"),
     (f"{HALL} dataset.held_out=2", "dataset.held_out=2: a number above 0 and below 1"),
     (f"{HALL} dataset.side_m=-1 dataset.split=blocks", "dataset.side_m=-1: a number above 0"),

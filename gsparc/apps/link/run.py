@@ -43,7 +43,7 @@ class LinkStudy:
             raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
         site.need_phase("gsparc link")
         if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
-            raise ValueError(f"antenna={self.antenna}: the target has {antennas}")
+            raise ValueError(f"antenna={self.antenna}: the channels have {antennas}, numbered from 0")
         self.tones, self.mcs = site.subcarriers_hz, settings["mcs"]
         self.count = SUBCARRIERS_PER_BLOCK * self.shape["blocks"]
         self.spacing_hz = 1e3 * self.shape["spacing_khz"]

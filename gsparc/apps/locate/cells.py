@@ -87,5 +87,5 @@ def cover_box(
     if open_at is not None:
         centre = centre[open_at(centre)]
         if not len(centre):
-            raise ValueError("locate: by the plan one can stand nowhere in the box of trained places")
+            raise ValueError("locate: the plan has no open floor where the model was trained")
     return Cells(centre, np.broadcast_to(edge, centre.shape).copy())

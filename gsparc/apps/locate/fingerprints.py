@@ -32,7 +32,7 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
     if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
         raise ValueError("dataset=fingerprints learns from its own rows: give dataset.file=FILE, and no ckpt")
     if config.offset_db is not None or config.plan is not None or config.prior != "box":
-        raise ValueError("offset_db, plan, prior: of trained models alone, not of fingerprints")
+        raise ValueError("offset_db, plan, prior: for trained models alone, not for fingerprints")
     POSITIVE.check("dataset.side_m", chosen.side_m)
     SHARE.check("dataset.held_out", chosen.held_out)
     rows = read_fingerprints(chosen.file)

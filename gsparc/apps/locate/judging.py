@@ -174,9 +174,9 @@ def _trust(
     try:
         learned = run.retraining(**brief)
     except DataError as error:
-        raise DataError(f"{error}: calibrate=0 goes without") from None
+        raise DataError(f"{error}; calibrate=0 goes without calibration") from None
     result = locating.learn_trust(learned, locator, int(config.calibrate), cells)
-    log.info("trust learned from %d snapshots that were left out: %s", result[1], result[0])
+    log.info("calibrated on %d snapshots that were left out: %s", result[1], result[0])
     return result
 
 

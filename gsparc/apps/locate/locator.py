@@ -125,7 +125,7 @@ def learn_trust(
     rng = np.random.default_rng(seed)
     inner_folds = learned.cut(folds, seed).folds
     for number, inner in enumerate(inner_folds):
-        log.info("group %d of %d: trained without %d rows", number + 1, len(inner_folds), len(inner.test))
+        log.info("calibration %d of %d: without %d rows", number + 1, len(inner_folds), len(inner.test))
         method = learned.refit(inner, learned.context.within(f"group{number}"))
         field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
@@ -157,7 +157,7 @@ def restore_trust(extra: Mapping[str, Any], unknown: Nuisances, share: float) ->
     """
     stored = extra.get(KEY)
     if stored is None:
-        log.warning("locate: never calibrated, areas are as wide as the model's own variances say")
+        log.warning("locate: never calibrated (run gsparc locate): areas follow the model's own variances")
         return Trust(level=share)
     before, promised = Nuisances(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):

@@ -128,15 +128,11 @@ class FieldMap:
             "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
             "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
             "width_db": of(self.at_best_server(self.upper_db - self.lower_db)),
-            "expected_error_db": of(self.layer("expected_error_db"), _root_mean_square),
+            "expected_error_db": of(self.layer("expected_error_db"), lambda v: np.sqrt(np.mean(v**2))),
             "threshold_db": self.threshold_db,
             "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
         }  # fmt: skip
         return {f"map/{name}": value for name, value in figures.items()} | {"map/unit": self.unit}
-
-
-def _root_mean_square(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def empty_layers(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:

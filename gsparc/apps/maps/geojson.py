@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
+UNREADABLE = OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError
 LINE, POLYGON = 1, 3  # of shapely's types; larger numbers are collections
 
 
@@ -52,15 +53,13 @@ def read_shapes(
             parts = np.array([shape(one) for one in features if one], object)
     except FileNotFoundError:
         raise DataError(f"{where}: no such file") from None
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
-    except shapely.errors.ShapelyError as error:
+    except (*UNREADABLE, shapely.errors.ShapelyError) as error:
         raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
     while (shapely.get_type_id(parts) > POLYGON).any():
         parts = shapely.get_parts(parts)
     kind = shapely.get_type_id(parts)
     if not (kind == POLYGON).any() and not (lines_too and (kind == LINE).any()):
-        raise DataError(f"{where}: holds no polygon; draw the area as a Polygon or MultiPolygon")
+        raise DataError(f"{where}: holds no polygon{' and no line' * lines_too}; draw one, as in a GIS")
     parts, kind = parts[np.isin(kind, (LINE, POLYGON))], kind[np.isin(kind, (LINE, POLYGON))]
 
     def in_metres(places: np.ndarray) -> np.ndarray:

@@ -217,7 +217,9 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
 
 def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     """Names on their areas; those of the largest also in the legend."""
-    for row, column, word in label_places(layer.values, layer.words):
+    (ny, nx), free = layer.values.shape, layer.values.copy()
+    free[: ny // 10, : nx // 6] = np.nan  # the scale bar is there
+    for row, column, word in label_places(free, layer.words):
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
                   path_effects=from_above.OUTLINE)  # fmt: skip
     listed = layer.class_table()

@@ -136,7 +136,7 @@ def place_station(
     site = predictor.site
     check_arguments(locals(), count=whole(1))
     if site.stations is None or site.static_end is None:
-        raise DataError(f"place: the model of {site.name} knows no stations among which to put another")
+        raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
     antenna = antenna or Antenna()
     still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]

@@ -109,7 +109,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     # A tenth of the site: blocks large against the distance between rows, and some hundred of them.
     side = settings.block_m or longest / 10
     if not side > 0:
-        raise DataError("a promise about a map needs rows at more than one place; measure more")
+        raise DataError("all rows are at one place: tested intervals need several; or promised=false")
 
     def evidence_without(number: int) -> Evidence:
         # Every second fold with sides twice as long, for evidence at larger distances.

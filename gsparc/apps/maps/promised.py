@@ -38,7 +38,7 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
     learned = reopen_training(path, settings["dataset"])
-    log.info("a promise for this map: %d fits without blocks of places", how.folds)
+    log.info("testing the intervals of maps: fits without blocks of places")
     promise = gather_promise(learned, how)
     promise.coverage(how.share)  # too little evidence is said before anything is stored
     promise.keep(path)
@@ -74,8 +74,8 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
-        own = "intervals are the model's own deviations, and places far from data are not refused"
-        return [*notes, f"no promise: {own}"]
+        own = "they are the model's own deviations, and no place is refused as too far from data"
+        return [*notes, f"intervals are not tested: {own}"]
     silent = f"of those not heard, as the model estimates, {coverage.silent_share:.1%}"
     apart = f" (of heard rows {coverage.heard_share:.1%}, {silent})"
     apart = "" if np.isnan(coverage.silent_share) else apart

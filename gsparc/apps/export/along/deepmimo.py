@@ -27,7 +27,7 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
     """
     site = predictor.site
     if site.static_position is None:
-        raise ValueError("to=deepmimo: the place of the static end is needed")
+        raise ValueError("to=deepmimo: where the static end stands must be known")
     paths = predictor.paths(**{site.moving_end: place})
     if paths.direction is None:
         raise ValueError("to=deepmimo: paths with directions are needed")

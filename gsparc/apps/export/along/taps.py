@@ -162,7 +162,7 @@ def fit_taps(
     error, total = np.concatenate(left), np.concatenate(power)
     if not total.all():
         at = places[int(np.argmin(total))].round(2).tolist()
-        raise ValueError(f"the model's channels are 0 at {at} m, as far from every measurement")
+        raise ValueError(f"the model predicts no power at {at} m, far from every measurement")
     residual = float(error.sum() / total.sum()), float((error / total).max())
     return TappedDelayLine(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
 

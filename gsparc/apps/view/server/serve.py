@@ -59,14 +59,14 @@ class Server:
         if gone:
             self.work.forget(client.client_id)
             return
-        log.info("client %d came, %d here", client.client_id, len(self.sessions))
+        log.info("client %d connected, %d in all", client.client_id, len(self.sessions))
 
     def _went(self, client: Any) -> None:
         with self._lock:
             if self.sessions.pop(client.client_id, None) is None:
                 self._gone.add(client.client_id)
         self.work.forget(client.client_id)
-        log.info("client %d went, %d here", client.client_id, len(self.sessions))
+        log.info("client %d left, %d in all", client.client_id, len(self.sessions))
 
     def run(self) -> None:
         """Until Ctrl-C."""
