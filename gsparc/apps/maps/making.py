@@ -170,11 +170,12 @@ def choose_stations(
             raise DataError(f"{key}={list(wanted)}: {predictor.site.name} has one station; leave it out")
         return [""], []
     names: list[str] = []
+    called = [*stations.name, *(getattr(stations, "label", None) or ())]
     for one in wanted if wanted is not None else stations.name:
-        number = station_number(one, stations.name, len(stations))
+        number = station_number(one, called, len(stations))
         if number is None:
-            raise DataError(f"{key}: no station {one!r}{suggest(str(one), stations.name)}")
-        names.append(stations.name[number])
+            raise DataError(f"{key}: no station {one!r}{suggest(str(one), called)}")
+        names.append(stations.name[number % len(stations)])
     if not names:
         raise DataError("stations=[]: name one at least, or all")
     notes = []

@@ -260,7 +260,7 @@ def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
 
 def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(predictor, monkeypatch):
     monkeypatch.setitem(vars(predictor.site.stations), "label", ("Roof 1", "Tower"))
-    found = predict_map(predictor, step_m=8.0, stations=["east", "west"])
+    found = predict_map(predictor, step_m=8.0, stations=["east", "Roof 1"])
     assert found.stations == ("Tower", "Roof 1")
     # What was measured is in dB, of what nobody said: the map says how it is called dBm.
     assert any("unit=dBm" in note for note in map_notes(found, None))
