@@ -11,6 +11,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.method import Method, Prediction
+from gsparc.models.target_rows import TINY_POWER
 
 
 @runtime_checkable
@@ -27,8 +28,8 @@ class SeparatesPaths(Protocol):
 
 
 def power(channels: Tensor) -> Tensor:
-    """Return the mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
-    return channels.abs().square().mean((1, 2)).clamp_min(1e-30)
+    """Return the mean square (B,) of channels (B, antennas, tones), at least `TINY_POWER`."""
+    return channels.abs().square().mean((1, 2)).clamp_min(TINY_POWER)
 
 
 def rms(channels: Tensor) -> Tensor:

@@ -14,7 +14,8 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.uplink.error_model import RelativeErrorRegression, SearchResult, estimate_noise
+from gsparc.models.relative_error import RelativeErrorRegression
+from gsparc.models.uplink.error_model import SearchResult, estimate_noise
 from gsparc.models.uplink.interface import UplinkMethod, power
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
@@ -159,14 +160,15 @@ class UplinkField(UplinkMethod):
     # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        error_model = None if self.error_model is None else vars(self.error_model)
-        return {"search": asdict(self.search.settings), "trust": error_model}
+        error_model = None if self.error_model is None else self.error_model.state()
+        return {"search": asdict(self.search.settings), "error_model": error_model}
 
     def restore(self, site: Site, state: Mapping[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
         self._prepare(site, SearchSettings(**state["search"]))
-        self.error_model = None if state["trust"] is None else RelativeErrorRegression(**state["trust"])
+        said = state["error_model"]
+        self.error_model = None if said is None else RelativeErrorRegression.read(said)
 
     def size(self) -> int:
         """Return the number of sources of a snapshot."""

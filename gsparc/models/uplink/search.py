@@ -23,6 +23,11 @@ LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction o
 REACH = (0.03, 0.006)  # prior standard deviation of a step: half a step of the grid
 
 
+def each_place(gain: Tensor) -> Tensor:
+    """Return gains (B, N) once for each coordinate of their sources, (B, 3 N): two cosines and a delay."""
+    return gain.repeat(1, 3)
+
+
 @dataclass(frozen=True)
 class Sources:
     """N sources of each of B snapshots, with the posterior of all of them together (Laplace's approximation).
@@ -65,7 +70,7 @@ class Sources:
         gram = Columns.of(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
         # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
-        gains = self.gain.repeat(1, 3)
+        gains = each_place(self.gain)
         slopes = gram[:, count:, count:] * gains[:, None] * gains.conj()[..., None]
         mixed = self.gain_slopes.mH @ (gram[:, :count, count:] * gains[:, None])
         from_gains = self.gain_slopes.mH @ (gram[:, :count, :count] @ self.gain_slopes)
@@ -156,7 +161,7 @@ class SourceSearch:
         torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
         cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
         gain = (inverse @ inner[:, :n, None])[..., 0]
-        gains = gain.repeat(1, 3)
+        gains = each_place(gain)
         slope = ((inner[:, n:] - (cross @ gain[..., None])[..., 0]) * gains.conj()).real
         gain_slopes = cross @ inverse
         # Variable projection: what other gains can make up for tells nothing of places.
@@ -185,7 +190,7 @@ class SourceSearch:
     ) -> Sources:
         """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
         reach = self._reach(fit.gain.shape[1])
-        gains = (fit.gain * scale[:, None]).repeat(1, 3)
+        gains = each_place(fit.gain * scale[:, None])
         spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
         return Sources(
             direction, delay, fit.gain * scale[:, None], fit.inverse * (noise * scale**2)[:, None, None],
