@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import co_array
 from gsparc.physics.separable import Separable, separable
 
 BLOCK = 128  # images at once
@@ -32,21 +33,17 @@ class Lags:
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
-        between = (array[:, None] - array[None]).reshape(-1, 3) / wavelength
-        unique, pairs = np.unique(np.round(between, 6), axis=0, return_counts=True)
-        # d and -d are conjugates: the half whose first coordinate other than zero is positive is enough
-        sign = np.array([next((np.sign(v) for v in row if v != 0), 0.0) for row in unique])
-        half = sign >= 0  # of sorted rows: the zero lag, which has no sine, is the first
-        differences = 2 * np.pi * unique[half]  # radians per unit of direction
-        self._differences = torch.from_numpy(differences.T.astype(np.float32))
-        self._share = torch.from_numpy((pairs[half] / len(array) ** 2).astype(np.float32))
-        self.count = 2 * len(self._share) - 1
-        angle = differences @ grid.directions().numpy().reshape(-1, 3).T
-        waves = np.concatenate([np.cos(angle), np.sin(angle[1:])])
+        known = co_array(array, wavelength)
+        differences = 2 * np.pi / wavelength * known.difference  # radians per unit of direction
+        self._differences = torch.from_numpy(differences.T).float()
+        # Of the pairs that are d apart, half are so the other way round.
+        pairs = known.real_pairs.sum(0)[: len(differences)]
+        pairs[1:] /= 2
+        self._share, self.count = (pairs / known.elements**2).float(), known.real_pairs.shape[1]
+        waves = known.basis(grid, wavelength).T
         # Of d and -d together: r e^(-j a) + conj(r) e^(j a) = 2 (Re r cos a + Im r sin a).
-        waves[1 : len(angle)] *= 2
-        waves[len(angle) :] *= 2
-        basis = torch.from_numpy(waves).reshape(self.count, grid.height, grid.width)
+        waves[1:] *= 2
+        basis = waves.reshape(self.count, grid.height, grid.width)
         self.pixels = separable(basis.split(BLOCK), LOST)  # in float64
         self._basis = self.pixels.of(basis.float())
         exact = self._basis.double()  # in float32, rounding would be most of the weakest lags

@@ -19,7 +19,7 @@ def _vectors(rows, elements, seed=0):
 @pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
 def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
-    lags = array_response.lags(array, WAVELENGTH)
+    lags = array_response.co_array(array, WAVELENGTH)
     direct = array_response.bartlett(h, array_response.steering(array, grid, WAVELENGTH)) ** 2
     v = torch.cat([h.real, h.imag], 1)
     numbers = torch.einsum("bi,kij,bj->bk", v, lags.forms(), v)
