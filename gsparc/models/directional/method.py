@@ -24,19 +24,17 @@ from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse
 from gsparc.models.image_sources.rows import gather
-from gsparc.models.image_sources.search import Found
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
-# Receivers with a ray to a source; of more sources those seen by most are kept.
-MIN_SEEN, MAX_SOURCES = 2, 60
+MIN_SEEN = 2  # receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
 MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
 REFINEMENT_ROWS = 400  # rows used for position refinement
 REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # meanwhile
 VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
-SELECTION_ROWS = 700  # rows that the kernel is chosen on
 
 
 class DirectionalGP(SourcesInFrame):
@@ -50,7 +48,7 @@ class DirectionalGP(SourcesInFrame):
     name = "directional_gp"
     posterior: SightedSources
 
-    def __init__(self, rows: int = 3000, seed: int = 0) -> None:
+    def __init__(self, rows: int = SearchSettings.rows, seed: int = 0) -> None:
         if rows < 8:
             raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
         self.row_limit, self.seed = rows, seed
@@ -78,7 +76,8 @@ class DirectionalGP(SourcesInFrame):
         sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
         if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
-        sources = sources[seen[:, sources].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
+        order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
+        sources = sources[order[: SearchSettings.max_sources]]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = Frame.of(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
@@ -118,7 +117,7 @@ class DirectionalGP(SourcesInFrame):
 
     def _refit(self) -> None:
         """Powers and kernel."""
-        few = self._few(SELECTION_ROWS).learned()
+        few = self._few(SearchSettings.search_rows).learned()
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:

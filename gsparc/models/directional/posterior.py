@@ -17,7 +17,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from gsparc.models.directional.position_refine import UncertainPositions, coherence
+from gsparc.models.directional.position_refine import TINY, UncertainPositions, coherence
 from gsparc.models.directional.visibility import VisibilityGP
 from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows
@@ -145,7 +145,7 @@ class SightedSources:
         """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
-        power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
+        power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, TINY)), self.kernel
         coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
         for _ in range(ROUNDS):
             covariance = self._cross(self.waves, coherent, power)
@@ -158,8 +158,7 @@ class SightedSources:
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
             known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
-            # A power of 0 would stay 0 for ever: every update is proportional to it.
-            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(TINY)
         return replace(self, power=power, kernel=kernel)
 
     def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:

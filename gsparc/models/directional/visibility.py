@@ -12,13 +12,14 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out as residuals
 
-LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
+LENGTHS_M = tuple(0.05 * 2.0 ** np.arange(7))  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance
 SPURIOUS = 0.003  # initial share of the pairs without a path that have a ray
 MIN_RATE = 1e-3  # lower bound of either rate

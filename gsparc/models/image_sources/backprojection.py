@@ -18,6 +18,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, steering
+from gsparc.physics.draws import draw_in_box
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -84,11 +85,11 @@ def search_box(
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
     `spread` gives the images of the static end's antennas, as `score` takes them.
     """
-    share = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
-    candidates = box[0] + (box[1] - box[0]) * share
+    low, high = box
+    candidates = draw_in_box(low, high, CANDIDATES, generator)
     rough = quick_score(posterior.rows, spread(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(512)])
+    exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(BLOCK)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
     optimizer = torch.optim.Adam([polished], betas=BETAS)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
-from gsparc.models.image_sources.refine import learn_visibility, refine
+from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
@@ -93,7 +93,7 @@ def search_many(
 
         search = Search(rows, transmitter, settings, number, last_round, start)
         scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
-        scene = refine(rows, learn_visibility(rows, scene, 10, KernelVisibility()), 20)
+        scene = refine(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
         if look is not None and number == 0:
             look(rows, scene)
         error = left_out_error(rows, scene)
@@ -136,7 +136,7 @@ def search_many(
 
 def refined(rows: Rows, member: Member) -> Member:
     """Return a search's result on rows that have changed a little."""
-    scene = refine(rows, member.scene, 20)
+    scene = refine(rows, member.scene, POLISHING_STEPS)
     return Member(scene, left_out_error(rows, scene), member.number)
 
 
@@ -158,5 +158,5 @@ def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2
 
 def weights_of(members: list[Member]) -> Tensor:
     """Return weights of the searches in the average, (M,) float32 of sum 1."""
-    error = torch.tensor([max(member.left_out, 1e-6) for member in members])
+    error = torch.tensor([member.left_out for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.rows import Rows, channel_places, static_array
+from gsparc.models.image_sources.rows import Rows, channel_places, moving_end, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 
@@ -51,7 +52,7 @@ class Frame:
         power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
         if not power > 0:
             raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
-        return Frame(site, antennas, rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
+        return Frame(site, antennas, rows.position.mean(0), math.sqrt(float(power)), carrier)
 
     def inside(self, rows: Rows) -> Rows:
         """Return rows in local metres and stored units, normalised."""
@@ -63,10 +64,11 @@ class Frame:
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
+        rotation = query.rx.rotation.cpu().double()
+        rotation = rotation.reshape(-1, *rotation.shape[-2:])
         position = query.rx.position if self.site.moving_end == "rx" else query.tx
         # float64: phases need lengths to a fraction of a wavelength.
-        position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
+        position = position.cpu().double().expand(len(query), -1) - self.middle
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
@@ -135,8 +137,8 @@ class SourcesInFrame(ClosedForm):
         gain, away, sources = self._paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
-        towards = sources - places[:, :3].reshape(count, -1, 3).mean(1)[:, None]
-        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        ends = moving_end(places)
+        unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
         return *each_once(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
     def _fitted(self) -> Frame:

@@ -24,14 +24,15 @@ from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
+from gsparc.models.image_sources.refine import POLISHING_STEPS
 from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.plain import made, plain
 from gsparc.models.reduced import MeanOnly
-from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.mirror_planes import normal_form, orientations
 from gsparc.physics.row_factors import Freedom, turning
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
@@ -68,9 +69,10 @@ class ImageSourceGP(SourcesInFrame):
     start: Found | None = None
 
     def __init__(
-        self, searches: int = 6, search_rows: int = 700, rows: int = 3000,
-        margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Snapshot = "none",
-        clutter: bool = True, seed: int = 0,
+        self, searches: int = SearchSettings.searches, search_rows: int = SearchSettings.search_rows,
+        rows: int = SearchSettings.rows, margin: float = SearchSettings.margin,
+        max_sources: int = SearchSettings.max_sources, order: int = SearchSettings.order,
+        offsets: Snapshot = "none", clutter: bool = True, seed: int = 0,
     ) -> None:  # fmt: skip
         self.settings = SearchSettings(
             searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
@@ -92,8 +94,8 @@ class ImageSourceGP(SourcesInFrame):
         # The frame is of rows of all searches: their scenes are averaged in it.
         self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
         noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
-        # -50 dB of the rows' power: simulated channels may have no noise, and float32 needs some to factor.
-        self.noise_floor = max(1e-5, noise / self.frame.scale**2)
+        # Simulated channels may have no noise, and float32 needs some to factor.
+        self.noise_floor = max(JITTER, noise / self.frame.scale**2)
         notes: list[str] = []
         self.factors = torch.ones(antennas, dtype=torch.complex64)
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
@@ -225,7 +227,7 @@ class ImageSourceGP(SourcesInFrame):
         direct = Scene.direct(self._transmitter(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
-            few = replace(self.settings, max_sources=sources, final_steps=20, clutter=False)
+            few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
             rows = self._searched_rows(aligned, known, 0)
             scene = self._search([rows], few, budget)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
@@ -238,10 +240,8 @@ class ImageSourceGP(SourcesInFrame):
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency = data.site.tones()
-        places = measured_places(data, known).clone()
-        places[..., :3] -= self.frame.middle
-        turned = orientations(scene.planes, scene.sequences)
-        away = ranges_at(places.flatten(0, 1), scene.sources, turned)
+        places, turned = measured_places(data, known), orientations(scene.planes, scene.sequences)
+        away = ranges_at(places.flatten(0, 1), scene.sources + self.frame.middle, turned)
         waves = wave_over_band(away, torch.from_numpy(frequency))
         # Antennas of known places share the gains; those of unknown ones each have their own.
         if gains.shape[1] == 1 or places.shape[1] > 1:
@@ -316,11 +316,10 @@ class ImageSourceGP(SourcesInFrame):
     def objects(self) -> SiteObjects:
         """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
-        planes = scene.planes.double()
-        normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        normal, offset = normal_form(scene.planes.double())
         # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
-        moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
-        boxes = scene.clutter.boxes.double().view(-1, 2, 3) + middle
+        moved = torch.cat([normal, offset + (normal @ middle)[:, None]], 1)
+        boxes = scene.clutter.boxes.double().unflatten(1, (2, -1)) + middle
         return SiteObjects.of(moved.numpy(), boxes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:

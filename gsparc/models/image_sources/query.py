@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
-from gsparc.models.image_sources.rows import ranges_at
+from gsparc.models.image_sources.rows import moving_end, ranges_at
 from gsparc.models.image_sources.scene import directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
@@ -18,6 +18,7 @@ from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import apart
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
+MATERN32 = 3  # factor of squared distances over lengths in Matern-3/2
 VARIANCE_ROWS = 350  # that a variance is computed from: fewer overestimate it
 
 
@@ -47,11 +48,14 @@ class Means:
         self.sources = torch.cat([scene.sources for scene in scenes])
         self.orientations = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
         kernels = [scene.visibility for scene in scenes]
-        # Constant, 6 / angle^2 and 3 / length^2.
-        numbers = [(float(k.constant), 6 * float(k.angle) ** -2, 3 * float(k.length) ** -2) for k in kernels]
+        # |u - v|^2 of unit vectors is 2 - 2 u.v.
+        numbers = [
+            (float(k.constant), 2 * MATERN32 / float(k.angle) ** 2, MATERN32 / float(k.length) ** 2)
+            for k in kernels
+        ]
         each = torch.repeat_interleave(torch.tensor(numbers), torch.tensor(self.counts), 0)
         constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
-        toward = directions(self.places[:, :3], self.sources)
+        toward = directions(moving_end(self.places), self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
         # Not at the first query, which may be for inference alone.
         hides = any(len(scene.clutter) for scene in scenes)
@@ -68,7 +72,7 @@ class Means:
         """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
         if not self.hiding:
             return None
-        places = queries[:, :3]
+        places = moving_end(queries)
         return torch.cat([hidden.visible_share(legs.paths(places)) for legs, hidden in self.hiding])
 
     def ranges(self, queries: Tensor) -> Tensor:
@@ -83,7 +87,7 @@ class Means:
         dtype = self.towards.dtype
         squared = apart(queries, self.places).square().to(dtype)
         scaled = torch.addcmul(self.by_angle, squared, self.by_length)
-        scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources, dtype), self.towards)
+        scaled = torch.baddbmm(scaled, directions(moving_end(queries), self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances
         decay = torch.exp(-root)
         return torch.addcmul(decay, root, decay)

@@ -17,9 +17,11 @@ from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
+ROUND_STEPS, POLISHING_STEPS = 12, 20  # after a change of some sources, and of all
+VISIBILITY_STEPS = 10  # of `learn_visibility`
 DECAY_AFTER, DECAY = 0.6, 0.3  # smaller steps for the last 40 %
 TRANSMITTER_STEP = 0.0004  # [m]; small, its position is measured
-PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and along it [m]
+NORMAL_STEP, OFFSET_STEP = 0.0012, 0.004  # of a plane's unit normal, and along it [m]
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
@@ -38,8 +40,9 @@ def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Sc
     """
     values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
-    rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
-    rates += [torch.tensor(STEP)] * (len(values) - 2)
+    normal, offset = scene.planes.split((3, 1), 1)
+    plane_steps = torch.cat([torch.full_like(normal, NORMAL_STEP), torch.full_like(offset, OFFSET_STEP)], 1)
+    rates: list[Tensor | float] = [TRANSMITTER_STEP, plane_steps, *[STEP] * (len(values) - 2)]
     first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
     best, lowest, correlation = values, math.inf, torch.empty(0)
     for step in range(steps + 1):
@@ -76,12 +79,14 @@ def _likelihood(
     rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
-    transmitter, planes, *phases = (v.detach().requires_grad_() for v in (*values[:2], *values[4:]))
+    transmitter, planes, log_amplitude, log_noise, *phases = values
+    transmitter, planes, *phases = (v.detach().requires_grad_() for v in (transmitter, planes, *phases))
+    amplitude, noise = log_amplitude.exp(), log_noise.exp()
     waves = steering(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
     for phase in phases:
         waves = waves * torch.polar(torch.ones(()), phase)
     waves = waves * scene.visible_share(rows.position)
-    scaled, noise = waves.detach() * values[2].exp(), values[3].exp()
+    scaled = waves.detach() * amplitude
     gains = Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
@@ -90,13 +95,15 @@ def _likelihood(
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     leaves = [transmitter, planes, *phases]
     by_place, by_plane, *by_phase = torch.autograd.grad(
-        waves, leaves, by_waves * values[2].exp(), materialize_grads=True
+        waves, leaves, by_waves * amplitude, materialize_grads=True
     )
     by_noise = noise * gains.by_noise(conditioned.slope)
     return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
 
 
-def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
+def learn_visibility(
+    rows: Rows, scene: Scene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
+) -> Scene:
     """Fit the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
@@ -105,8 +112,8 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
     Args:
         rows: a few hundred are enough.
         scene: the start.
-        steps: of Adam.
         centre: of the prior.
+        steps: of Adam.
     """
     shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
     about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
@@ -117,7 +124,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
         trial = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
         if scene.quadrature == 1:
             return trial
-        return replace(trial, quadrature=float(torch.sigmoid(value.detach()[3])))
+        return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))
 
     for _ in range(steps):
         if late():
@@ -125,7 +132,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
         posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
-            gains.quadrature = torch.sigmoid(value[3])
+            gains.quadrature = torch.sigmoid(value[-1])
         scaled = posterior.waves * scene.log_amplitude.exp()
         loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):

@@ -10,11 +10,12 @@ from typing import final
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows
-from gsparc.physics.mirror_planes import Reflections, all_sequences, images
+from gsparc.models.image_sources.rows import Rows, moving_end
+from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
 
@@ -44,7 +45,7 @@ class KernelVisibility:
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared(directions(places[:, :3], source)) / self.angle**2
+        squared = _squared(directions(moving_end(places), source)) / self.angle**2
         if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
         squared = squared + _squared(places).float() / self.length**2
@@ -100,7 +101,7 @@ class Scene:
     @staticmethod
     def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
         """Return the static end (3,) [m] alone, of log amplitude (1,)."""
-        return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
+        return Scene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
 
     @cached_property
     def sources(self) -> Tensor:
@@ -145,8 +146,7 @@ class Scene:
 
     def waves(self, rows: Rows) -> Tensor:
         """Return the same, attenuated by clutter."""
-        waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
-        return waves if self.phase is None else waves * self.turns
+        return self.unobstructed(rows) * self.visible_share(rows.position)
 
     def longer(self, order: int) -> list[Reflections]:
         """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
@@ -196,7 +196,7 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
         ValueError: the images of the antennas are missing.
     """
     if rows.element is not None:
-        if sources.dim() != 3:
+        if sources.dim() == 2:
             raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
         sources = sources.index_select(0, rows.element)  # (n, K, 3)
     return wave(ranges(rows.position, sources), rows.frequency[:, None])
@@ -215,8 +215,7 @@ def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tenso
 
 def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
-    offset = places - sources[..., None, :]
-    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
+    return normalize(places - sources[..., None, :], dim=-1).to(dtype)
 
 
 def _is_wide(places: Tensor, length: float) -> bool:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from typing import get_args
 
 import torch
@@ -17,7 +18,13 @@ from gsparc.field.initial import Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.refine import learn_visibility, refine
+from gsparc.models.image_sources.refine import (
+    POLISHING_STEPS,
+    ROUND_STEPS,
+    VISIBILITY_STEPS,
+    learn_visibility,
+    refine,
+)
 from gsparc.models.image_sources.rows import Rows, box_of
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
@@ -30,10 +37,10 @@ NOISE = 0.1  # variance at the start, of unit signal power
 PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
-STEPS = 12  # of refinement after each round
 PRUNE = 5.0  # least gain of a source kept [nats]
 Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
-PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
+PATIENCE, PROGRESS = 3, SEQUENCE_SCORE  # rounds without a gain of a source's nats, that end the search
+REARRANGED_EVERY = 3  # rounds between attempts at walls, and at the visibility's lengths
 LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
 
@@ -59,7 +66,7 @@ class SearchSettings(Checked):
     rows: int = setting(3000, whole(8))
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
-    order: int = setting(3, whole(0))
+    order: int = setting(orders.ORDER, whole(0))
     offsets: Snapshot = setting("none", choice(*get_args(Snapshot)))
     clutter: bool = setting(True, switch())
     seed: int = 0
@@ -98,23 +105,23 @@ class Search:
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
-        self._refine(STEPS)
+        self._refine(ROUND_STEPS)
         self._find_walls()  # among sources that it starts from
-        for number in range(60):
+        for number in count():
             added = self._add_sequences()
             free = not added
             if free:
                 added = self._add_free()
             if not added or self.last_round():
                 break
-            self._refine(STEPS)
+            self._refine(ROUND_STEPS)
             if free or number % 2:
                 self.scene = orders.drop_planes(self.rows, self.scene, 2 * self.wavelength)
-            if number >= 4 and number % 3 == 1:
+            if number > 1 and number % REARRANGED_EVERY == 1:
                 self._find_walls()
             if number % 2:
                 self.scene = orders.prune(self.rows, self.scene, PRUNE)
-            if number % 3 == 2:
+            if number % REARRANGED_EVERY == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
             log.debug(
@@ -129,14 +136,14 @@ class Search:
         return self._finish()
 
     def _finish(self) -> Scene:
-        self._refine(20)
+        self._refine(POLISHING_STEPS)
         self._find_walls()
         self._reassign(orders.orthogonal_walls(self.scene))
         self.scene = orders.drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
-        self._refine(STEPS)
+        self._refine(ROUND_STEPS)
         self.scene = orders.prune(self.rows, self.scene, PRUNE)
-        self._learn_visibility(10)
+        self._learn_visibility(VISIBILITY_STEPS)
         self._refine(self.settings.final_steps)
         return self.scene
 
@@ -146,7 +153,7 @@ class Search:
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, KernelVisibility())
+            self.scene = learn_visibility(few, self.scene, KernelVisibility(), steps)
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
@@ -231,10 +238,10 @@ class Search:
             return
         before = self.scene
         self.scene = orders.reassign(before, walls)
-        self._refine(20)
+        self._refine(POLISHING_STEPS)
         for _ in range(2):
             if self._add_sequences(6):
-                self._refine(STEPS)
+                self._refine(ROUND_STEPS)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved
         if Posterior(self.rows, self.scene).nll >= allowed:

@@ -75,7 +75,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
     told, _, _ = shoebox(150, pillar=True, snr_db=60.0)
     scene = _scene(_boxed(_box()), order=2)
     places = torch.from_numpy(told.rx.copy())
-    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes, soft=1e-4).T.numpy()
+    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes).T.numpy()
     true = told.images.of(told.tx[0])
     at_noise_floor = 0.0
     for k, source in enumerate(scene.sources.numpy()):

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import past_boxes
+from gsparc.models.image_sources.clutter.blocking import MARGIN, past_boxes
 from gsparc.models.image_sources.clutter.residual import Unexplained
+from gsparc.physics.draws import draw_in_box, draw_sides
 
-THINNEST = 0.03  # [m]
+THINNEST = MARGIN  # [m]: thinner ones block nothing
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
 TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
 PARENTS, CHILDREN = 12, 6  # of the evolution strategy; children of each parent and round
@@ -69,14 +69,16 @@ def find_box(left: Unexplained, draws: int = 1000) -> tuple[Tensor, float]:
 
 def clipped_to(boxes: Tensor, room: Tensor) -> Tensor:
     """Return boxes (m, 6) cut to the room; of one outside, low corners lie above high ones."""
-    low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
-    return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
+    low, high = boxes.chunk(2, 1)
+    low = torch.minimum(low, high - THINNEST)
+    return torch.cat([torch.maximum(low, room[0]), torch.minimum(high, room[1])], 1)
 
 
 def _random(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
-    middle = room[0] + (room[1] - room[0]) * torch.rand(count, 3, generator=generator)
+    lowest, highest = room
+    middle = draw_in_box(lowest, highest, count, generator)
     kind = torch.rand(count, generator=generator)
-    size = SMALLEST * torch.exp(torch.rand(count, 3, generator=generator) * math.log(LARGEST / SMALLEST))
+    size = draw_sides(SMALLEST, LARGEST, middle, generator)
     size[kind < TABLES, 2] = 2 * THINNEST
     low, high = middle - size / 2, middle + size / 2
     low[kind > FLOOR, 2] = room[0, 2]

@@ -19,7 +19,8 @@ from gsparc.models.image_sources.clutter.boxes import evolve
 from gsparc.models.image_sources.clutter.residual import Unexplained
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import steering
-from gsparc.physics.mirror_planes import reflect
+from gsparc.physics.draws import draw_in_box, draw_sides
+from gsparc.physics.mirror_planes import normal_form, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -54,11 +55,12 @@ def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
         )
 
     def repaired(patches: Tensor) -> Tensor:
-        lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
-        return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
+        lower, upper = patches.chunk(2, 1)
+        lower = torch.minimum(lower, upper - MIN_SIDE)
+        return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
-    middle = low + (high - low) * torch.rand(DRAWS, 2, generator=left.generator)
-    side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=left.generator) * math.log(LARGEST / SMALLEST))
+    middle = draw_in_box(low, high, DRAWS, left.generator)
+    side = draw_sides(SMALLEST, LARGEST, middle, left.generator)
     starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[score(starts).topk(8).indices]
     return evolve(starts, score, repaired, left.generator, rounds=10)
@@ -80,8 +82,8 @@ class SmallMirror:
 
     def same(self, other: SmallMirror, apart: float) -> bool:
         """Whether both are parallel, closer than `apart` [m] and overlap."""
-        parallel = (self.plane[:3] @ other.plane[:3]).abs() >= PARALLEL
-        if not parallel or (self.plane[3] - other.plane[3]).abs() > apart:
+        (normal, offset), (normal2, offset2) = map(normal_form, (self.plane, other.plane))
+        if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > apart:
             return False
         low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
         return bool((high > low).all())
@@ -100,7 +102,7 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
     for plane in known:
-        normal = plane[:3] / plane[:3].norm()
+        normal, _ = normal_form(plane)
         if any((normal @ other).abs() >= PARALLEL for other in normals):
             continue
         normals.append(normal)
@@ -108,7 +110,7 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
         offsets = torch.arange(
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
         )
-        candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
+        candidates = torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1)
         many = 1 + 2 * len(known)
         count = math.prod(_cells(room, tangents(candidates[0]), CELL)) * many * len(candidates)
         if count > MAX_CELLS:
@@ -148,7 +150,7 @@ def _raster(left: Unexplained, candidates: Tensor, known: Tensor, cell: float) -
         tables.append(binned)
     stacked = (torch.stack(each).cumsum(-1).cumsum(-2) for each in zip(*tables, strict=True))
     sums = [torch.nn.functional.pad(each, (1, 0, 1, 0)) for each in stacked]  # integral images
-    total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
+    total, best = torch.zeros(len(candidates)), torch.zeros(candidates.shape)
     # a few cells, or all there are: a wall that was missed
     sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
     for wide, high_by in product(*sizes):
@@ -183,7 +185,7 @@ def _sources(
     meetings = [_meeting(places, once, candidates)]
     for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
         meetings.append(_meeting(places, after, candidates))
-        first = _meeting(places, before, wall[None].expand(len(candidates), 4))
+        first = _meeting(places, before, wall.expand_as(candidates))
         meetings.append(_meeting(first, once, candidates))
     sources = _images(rows.static_ends(transmitter), candidates, known)
     return [(steering(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
@@ -199,9 +201,8 @@ def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
     """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
-    normal, offset = planes[:, None, :3].float(), planes[:, None, 3].float()
-    end = end[:, None].float()
+    normal, offset = (part.float() for part in normal_form(planes[:, None]))
+    offset, end = offset[..., 0], end[:, None].float()
     above, below = (start * normal).sum(-1) - offset, (end * normal).sum(-1) - offset
-    share = above / torch.where((above - below).abs() < 1e-6, torch.ones_like(above), above - below)
-    share = torch.where((above * below < 0), share, torch.full_like(share, math.nan))
+    share = torch.where(above * below < 0, above / (above - below), math.nan)
     return start + share[..., None] * (end - start)

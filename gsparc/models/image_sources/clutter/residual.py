@@ -24,7 +24,9 @@ from gsparc.processes.worker import raise_if_cancelled
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
 BLOCK = 64  # candidates at a time
-CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
+LEAST_VARYING = 0.01  # share of a gain's variance, by the same factor up to two fifths
+CONSTANTS = tuple(1 - LEAST_VARYING * TRIED**number for number in range(9, -1, -1))  # candidates
+NEGLIGIBLE = 1e-2  # squared size of a whitened change that the constant parts take up almost wholly
 
 
 class Residual:
@@ -162,8 +164,8 @@ class CandidateScorer:
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
-        # A change that the constant parts take up almost wholly has no size of its own.
-        multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
+        # A negligible change has no size of its own.
+        multiple = torch.where(power > NEGLIGIBLE, matched / power.clamp_min(NEGLIGIBLE), 0.0)
         return multiple * matched / 2, multiple
 
     def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,7 +176,7 @@ class CandidateScorer:
             [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
         ]
         along, across = (self.residual @ part for part in parts)
-        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(1e-9)
+        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(NEGLIGIBLE**2)
         gain = torch.complex(
             (dot[1][1] * along - dot[0][1] * across) / determinant,
             (dot[0][0] * across - dot[0][1] * along) / determinant,

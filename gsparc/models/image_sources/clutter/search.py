@@ -11,13 +11,14 @@ from functools import partial
 import torch
 
 from gsparc.models.image_sources.backprojection import pick_apart
-from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
+from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, Clutter, visible_share
 from gsparc.models.image_sources.clutter.boxes import clipped_to, find_box
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
 from gsparc.models.image_sources.clutter.refine import descend
 from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.reflection_orders import ORDER
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import Reflections
@@ -26,14 +27,13 @@ from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_canc
 
 log = logging.getLogger(__name__)
 
-BOX, PATCH, MIRROR, SEQUENCE = 6, 4, 5, 1  # parameters of each; a mirror is a patch on a new plane
+MIRROR, SEQUENCE = PATCH + 1, 1  # parameters: of a patch and its plane's offset, of an amplitude
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
 EPOCHS = 6  # rounds of everything
 STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
 MIN_GAIN = 12.0  # least [nats] of a candidate, predicted
 BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
-ORDER = 3  # largest of the reflections tried
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
+from gsparc.models.image_sources.clutter.search import INITIAL_KERNEL
 from gsparc.models.image_sources.ensemble import Look, Member, compact, left_out_error
 from gsparc.models.image_sources.gp_likelihood import with_phases
 from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
@@ -20,7 +21,7 @@ from gsparc.models.image_sources.refine import learn_visibility, refine
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
-from gsparc.physics.mirror_planes import Reflections
+from gsparc.physics.mirror_planes import Reflections, normal_form
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
@@ -30,8 +31,7 @@ log = logging.getLogger(__name__)
 LEAST_SIDE = 2.0  # wavelengths; smaller rectangles hide, but mirror nothing
 MOVED_M, TURNED = 0.02, 0.01  # standard deviations of walls about those of the file [m], [rad]
 LOG_AMPLITUDE_STD = 0.1  # about a factor per reflection
-KERNEL, QUADRATURE = KernelVisibility(0.95, 0.6, 1.5), 0.1  # where walls say who sees what
-STEPS = (10, 80)  # of descent on the visibility kernel, then on planes, amplitudes and phases
+KERNEL, QUADRATURE = replace(INITIAL_KERNEL, constant=0.95), 0.1  # where walls say who sees what
 
 
 class KnownWallsGP(ImageSourceGP):
@@ -71,9 +71,9 @@ class KnownWallsGP(ImageSourceGP):
 
         with late_when(budget.over):
             scene = with_phases(rows, given, QUADRATURE, self.noise_floor)
-            scene = learn_visibility(rows, scene, STEPS[0], self.kernel)
+            scene = learn_visibility(rows, scene, self.kernel)
             prior = ReflectionPhasePrior.of(scene)
-            scene = refine(rows, scene, STEPS[1], cost)
+            scene = refine(rows, scene, settings.final_steps, cost)
         error = left_out_error(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
@@ -155,9 +155,9 @@ def walls_cost(
     known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
 ) -> Tensor:
     """Return the negative log prior [nats]: planes (P, 4) about those known, amplitudes (K,) about a law."""
-    normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
-    moved = (planes[:, 3] - known[:, 3]).square().sum() / MOVED_M**2
-    turned = (normal - known[:, :3]).square().sum() / TURNED**2
+    (normal, offset), (given_normal, given_offset) = map(normal_form, (planes, known))
+    moved = (offset - given_offset).square().sum() / MOVED_M**2
+    turned = (normal - given_normal).square().sum() / TURNED**2
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     law = torch.stack([torch.ones_like(order), order], 1)
     left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
