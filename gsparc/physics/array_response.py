@@ -65,7 +65,7 @@ def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
     return _SafeAbsolute.apply(vectors @ matrix.conj())
 
 
-def normalised(image: Tensor, how: str) -> Tensor:
+def normalise_spectrum(image: Tensor, how: str) -> Tensor:
     """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1) or `none`.
 
     >>> normalised(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import co_array
-from gsparc.physics.separable import Separable, separable
+from gsparc.physics.separable import Separable, fit_separable
 
 BLOCK = 128  # images at once
 RIDGE = 1e-7  # of the mean energy: directions beyond the horizon leave some lags undetermined
 LOST = 1e-12  # of the energy of a lag's image in its separable form: a float32's rounding
 
 
-class Lags:
+class SpectrumLags:
     """The lags of an array on a grid.
 
     Args:
@@ -44,7 +44,7 @@ class Lags:
         # Of d and -d together: r e^(-j a) + conj(r) e^(j a) = 2 (Re r cos a + Im r sin a).
         waves[1:] *= 2
         basis = waves.reshape(self.count, grid.height, grid.width)
-        self.pixels = separable(basis.split(BLOCK), LOST)  # in float64
+        self.pixels = fit_separable(basis.split(BLOCK), LOST)  # in float64
         self._basis = self.pixels.of(basis.float())
         exact = self._basis.double()  # in float32, rounding would be most of the weakest lags
         gram = exact @ exact.T

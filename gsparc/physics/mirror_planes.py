@@ -69,7 +69,7 @@ def images(
     return place
 
 
-def orientations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
+def image_rotations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
     """Return orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
 
     One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.

@@ -14,7 +14,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.models.array_vectors.vector_gp import align, refine_alignment
+from gsparc.models.array_vectors.vector_gp import align_along_tree, refine_alignment
 from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, SmoothRough
@@ -30,7 +30,7 @@ FEW = 4  # samples, of fewer than which none is predicted
 
 
 @dataclass(frozen=True)
-class Tuned:
+class ChosenKernel:
     """The chosen kernel and its held-out errors.
 
     Attributes:
@@ -46,10 +46,10 @@ class Tuned:
     left_out: LeftOut | None = None
 
 
-def tune(
+def choose_kernel(
     vectors: np.ndarray, positions: np.ndarray, images: np.ndarray, matrix: np.ndarray, wavelength: float,
     partner: np.ndarray | None, seed: int = 0,
-) -> Tuned:  # fmt: skip
+) -> ChosenKernel:  # fmt: skip
     """Choose a kernel.
 
     Args:
@@ -73,7 +73,7 @@ def tune(
         background=background[pixels] ** 2, centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
         gaps=np.array(GAPS) * wavelength, distance=cdist(positions, positions),
     )  # fmt: skip
-    aligned = align(vectors, positions, partner)
+    aligned = align_along_tree(vectors, positions, partner)
 
     def kernel_at(parameters: np.ndarray) -> Kernel:
         length, noise = np.exp(np.clip(parameters, np.log(LEAST), np.log(LARGEST)))
@@ -90,7 +90,7 @@ def tune(
 
     starts = [np.log([length, NOISE]) for length in LENGTHS]
     if len(positions) < FEW:
-        return Tuned(kernel_at(starts[0]), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
+        return ChosenKernel(kernel_at(starts[0]), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
     first = min(starts, key=objective)
     refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
     optimum = minimize(
@@ -106,7 +106,7 @@ def tune(
     error = samples.error(predicted)
     seen = ~np.isnan(error)
     left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
-    return Tuned(kernel, unknown[seen], error[seen], left_out)
+    return ChosenKernel(kernel, unknown[seen], error[seen], left_out)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
 
 
 @dataclass(frozen=True)
-class Recovered:
+class RecoveredVectors:
     """Array vectors of n spectra.
 
     Attributes:
@@ -55,9 +55,9 @@ class Recovered:
         return np.hypot(self.residual, self.floor) > SUSPECT * self.expected
 
 
-def recover(
+def recover_vectors(
     site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
-) -> Recovered:
+) -> RecoveredVectors:
     """Return array vectors of spectra.
 
     Args:
@@ -183,12 +183,12 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor) -> Recovered:
+    def result(self, state: Tensor, cost: Tensor) -> RecoveredVectors:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
         residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
-        return Recovered(vectors, offset, residual, floor, expected)
+        return RecoveredVectors(vectors, offset, residual, floor, expected)
 
 
 def _search(

@@ -21,9 +21,9 @@ from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
 from gsparc.models.directional.posterior import GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
-from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse
-from gsparc.models.image_sources.rows import gather
+from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
+from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_phase_and_static_end
+from gsparc.models.image_sources.rows import draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
@@ -61,7 +61,7 @@ class DirectionalGP(SourcesInFrame):
             ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
         started = TimeBudget()
-        refuse(data.site, self.name)
+        require_phase_and_static_end(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
         known = np.concatenate([fold.train, fold.val])
@@ -78,12 +78,12 @@ class DirectionalGP(SourcesInFrame):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
-        everything = gather(data, known, self.row_limit, self.seed)
+        everything = draw_rows(data, known, self.row_limit, self.seed)
         self.frame = Frame.of(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}
         self.posterior = SightedSources(
-            self.frame.inside(everything),
+            self.frame.normalise(everything),
             torch.tensor([at[int(row)] for row in everything.receiver]),
             UncertainPositions(points - self.frame.middle, covariance),
             VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources]),
@@ -121,7 +121,7 @@ class DirectionalGP(SourcesInFrame):
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:
-        """Update visibility by the channels (see `flips`); returns how many entries changed.
+        """Update visibility by the channels (see `entries_to_flip`); returns how many entries changed.
 
         Only with one row per receiver: more of them determine the gains of their own receiver.
         """
@@ -129,14 +129,14 @@ class DirectionalGP(SourcesInFrame):
         if len(rows.unique()) < len(rows):
             return 0
         rays, probability = visibility.seen.float(), visibility.left_out.float()
-        rates = RayErrorRates.first(rays)
+        rates = RayErrorRates.initial(rays)
         for turn in range(VISIBILITY_UPDATES):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
                 self._refit()
             now = self.posterior
-            one = now.gains(now.at_rows(probability)) * now.unobstructed[:, :, None]
+            one = now.gains(now.at_rows(probability)) * now.unobstructed_waves[:, :, None]
             seen, odds = visibility.seen.float(), rates.odds(rays, probability)
-            flip = flips(seen[rows], odds[rows], *now.conditioned.left_out(), one)
+            flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), one)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])

@@ -23,9 +23,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsparc.models.directional.triangulation import SAME_SIGMAS
-from gsparc.models.image_sources.gp_likelihood import with_noise
+from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
@@ -134,7 +134,7 @@ class PositionRefinement:
     def _covariance_of(self, k: int) -> Tensor:
         """Covariance (n, n) of the rows by source k of unit power."""
         one = self.current.only(torch.tensor([k]))
-        wave = steering(self.rows, one.points)[:, 0] * self.visible[:, k]
+        wave = spherical_waves(self.rows, one.points)[:, 0] * self.visible[:, k]
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
 
@@ -149,7 +149,7 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            given = with_noise(self.total(), self.noise, self.rows.target)
+            given = condition_with_noise(self.total(), self.noise, self.rows.target)
             explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
             due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(TINY)).clamp(1 / MAX_RATIO, MAX_RATIO)
@@ -164,7 +164,7 @@ class PositionRefinement:
         if self.resolved[k]:
             places = self.current.points[k][None]
         else:
-            places = conditional.separated(self._draws(k), CELL / 2 * self.wavelength)
+            places = conditional.best_separated(self._draws(k), CELL / 2 * self.wavelength)
         places, spreads = conditional.refined(places)
         log_posterior = conditional.log_posterior(places) + 0.5 * torch.linalg.slogdet(spreads)[1]
         best = int(log_posterior.argmax())
@@ -201,7 +201,7 @@ class ConditionalLikelihood:
 
     def __init__(self, refinement: PositionRefinement, k: int) -> None:
         rows, prior = refinement.rows, refinement.prior
-        given = with_noise(refinement.total(without=k), refinement.noise, rows.target)
+        given = condition_with_noise(refinement.total(without=k), refinement.noise, rows.target)
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         self.rows, self.alpha = rows.take(in_view), given.weights[in_view]
         self.inverse = given.factor.inverse[in_view[:, None], in_view]
@@ -210,14 +210,14 @@ class ConditionalLikelihood:
 
     def log_posterior(self, points: Tensor) -> Tensor:
         """Log posterior (m,) float64 of places (m, 3), up to a constant."""
-        waves = steering(self.rows, points)
+        waves = spherical_waves(self.rows, points)
         matched = (waves.mH @ self.alpha).abs().square().sum(1)
         scale = 1 + self.power * (waves.conj() * (self.inverse @ waves)).real.sum(0)
         offset = points - self.centre
         rays = 0.5 * ((offset @ self.precision) * offset).sum(1)
         return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
 
-    def separated(self, points: Tensor, distance: float) -> Tensor:
+    def best_separated(self, points: Tensor, distance: float) -> Tensor:
         """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
         log_posterior = self.log_posterior(points)
         best: list[Tensor] = []
@@ -243,7 +243,7 @@ class ConditionalLikelihood:
 
     def _step(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
-        waves = steering(self.rows, points)  # (n, m)
+        waves = spherical_waves(self.rows, points)  # (n, m)
         whitened = self.inverse @ waves
         known = (waves.conj() * whitened).real.sum(0) + 1 / self.power
         gain = (waves.mH @ self.alpha) / known[:, None]  # (m, R)

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from gsparc.models.directional.position_refine import TINY, UncertainPositions, coherence
 from gsparc.models.directional.visibility import VisibilityGP
-from gsparc.models.image_sources.gp_likelihood import with_noise
+from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.in_double import in_double
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.conditioned import Conditioned
@@ -100,14 +100,14 @@ class SightedSources:
         return self.visibility.seen[self.observer].float()
 
     @property
-    def unobstructed(self) -> Tensor:
+    def unobstructed_waves(self) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, seen or not."""
-        return steering(self.rows, self.positions.points)
+        return spherical_waves(self.rows, self.positions.points)
 
     @cached_property
     def waves(self) -> Tensor:
         """The same, zero where a receiver does not see a source."""
-        return self.unobstructed * self.seen
+        return self.unobstructed_waves * self.seen
 
     @cached_property
     def uncertain(self) -> Tensor:
@@ -123,7 +123,9 @@ class SightedSources:
     def conditioned(self) -> Conditioned:
         """The rows given their covariance."""
         covariance = self._cross(self.waves, self._coherence(), self.power)
-        return with_noise(covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target)
+        return condition_with_noise(
+            covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target
+        )
 
     @cached_property
     def dual_weights(self) -> Tensor:
@@ -150,7 +152,7 @@ class SightedSources:
         for _ in range(ROUNDS):
             covariance = self._cross(self.waves, coherent, power)
             tried = {
-                each: with_noise(covariance * shared, each.noise, self.rows.target)
+                each: condition_with_noise(covariance * shared, each.noise, self.rows.target)
                 for each, shared in correlation.items()
             }
             kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
@@ -199,7 +201,9 @@ class SightedSources:
     def left_out(self) -> Tensor:
         """Return the rows (n, R), each receiver and its own visibility left out."""
         at = self.at_rows(self.visibility.left_out)
-        cross = self._cross(self.unobstructed * at.probability, at.retained, self.power) * at.correlation
+        cross = (
+            self._cross(self.unobstructed_waves * at.probability, at.retained, self.power) * at.correlation
+        )
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in groups_of(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)

@@ -100,7 +100,7 @@ class RayErrorRates:
     spurious: float
 
     @staticmethod
-    def first(rays: Tensor) -> RayErrorRates:
+    def initial(rays: Tensor) -> RayErrorRates:
         """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
@@ -119,7 +119,9 @@ class RayErrorRates:
         return torch.where(rays > 0, detected, undetected) + probability.log() - (1 - probability).log()
 
 
-def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
+def entries_to_flip(
+    seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor
+) -> Tensor:
     """Return (n, K) bool, at most one visibility entry to change per receiver.
 
     Args:

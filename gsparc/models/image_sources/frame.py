@@ -54,7 +54,7 @@ class Frame:
             raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
         return Frame(site, antennas, rows.position.mean(0), math.sqrt(float(power)), carrier)
 
-    def inside(self, rows: Rows) -> Rows:
+    def normalise(self, rows: Rows) -> Rows:
         """Return rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
@@ -139,7 +139,7 @@ class SourcesInFrame(ClosedForm):
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
         ends = moving_end(places)
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
-        return *each_once(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
+        return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
     def _fitted(self) -> Frame:
         if self.site is None or not self.size():
@@ -147,7 +147,9 @@ class SourcesInFrame(ClosedForm):
         return self.frame
 
 
-def each_once(gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float) -> tuple[Tensor, Tensor, Tensor]:
+def merge_equal_paths(
+    gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first.
 
     Args:
@@ -166,7 +168,7 @@ def each_once(gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float) -> t
     return summed, delay[..., kept], unit[:, kept]
 
 
-def refuse(site: Site, name: str) -> None:
+def require_phase_and_static_end(site: Site, name: str) -> None:
     """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
@@ -174,7 +176,7 @@ def refuse(site: Site, name: str) -> None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
 
 
-def refuse_turning(data: Measurements) -> None:
+def require_fixed_rotation(data: Measurements) -> None:
     """Raise a `ValueError` where a static receiver of several antennas turns between measurements."""
     antennas = data.target.shape[1]
     if static_array(data.site, antennas) is None:

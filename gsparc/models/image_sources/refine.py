@@ -11,7 +11,13 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene, correlations, steering
+from gsparc.models.image_sources.scene import (
+    BETAS,
+    KernelVisibility,
+    Scene,
+    spherical_waves,
+    visibility_correlations,
+)
 from gsparc.physics.mirror_planes import images
 from gsparc.processes.worker import late
 
@@ -29,7 +35,7 @@ SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and
 Cost = Callable[[list[Tensor]], Tensor]
 
 
-def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
+def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
     """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `late`.
 
     Args:
@@ -47,7 +53,9 @@ def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Sc
     best, lowest, correlation = values, math.inf, torch.empty(0)
     for step in range(steps + 1):
         if step % REFRESH == 0:
-            correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
+            correlation = visibility_correlations(
+                rows, images(values[0], values[1], scene.sequences), scene.visibility
+            )
         value, gradient = _likelihood(rows, scene, values, correlation)
         if cost is not None:
             leaves = [v.detach().requires_grad_() for v in values]
@@ -82,7 +90,7 @@ def _likelihood(
     transmitter, planes, log_amplitude, log_noise, *phases = values
     transmitter, planes, *phases = (v.detach().requires_grad_() for v in (transmitter, planes, *phases))
     amplitude, noise = log_amplitude.exp(), log_noise.exp()
-    waves = steering(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
+    waves = spherical_waves(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
     for phase in phases:
         waves = waves * torch.polar(torch.ones(()), phase)
     waves = waves * scene.visible_share(rows.position)
@@ -90,14 +98,14 @@ def _likelihood(
     gains = Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
-    conditioned = gains.given(noise + scene.noise_floor)
-    by_waves = gains.by_waves(conditioned.slope, scaled, correlation)
+    conditioned = gains.condition(noise + scene.noise_floor)
+    by_waves = gains.slope_by_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     leaves = [transmitter, planes, *phases]
     by_place, by_plane, *by_phase = torch.autograd.grad(
         waves, leaves, by_waves * amplitude, materialize_grads=True
     )
-    by_noise = noise * gains.by_noise(conditioned.slope)
+    by_noise = noise * gains.slope_by_noise(conditioned.slope)
     return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
 
 
@@ -137,7 +145,7 @@ def learn_visibility(
         loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):
             correlation = KernelVisibility.of(value).correlation(rows.places, source)
-            loss = loss + (gains.by_correlation(slope, scaled[:, k]) * correlation).sum()
+            loss = loss + (gains.slope_by_correlation(slope, scaled[:, k]) * correlation).sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

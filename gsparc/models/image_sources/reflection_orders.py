@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.refine import ROUND_STEPS, refine
+from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, normal_form, reflect
@@ -35,7 +35,7 @@ def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
     while index < len(scene.planes) and not late():
         shorter = _without_plane(scene, index, tolerance)
         if shorter is not None:
-            shorter = refine(rows, shorter, ROUND_STEPS)
+            shorter = refine_scene(rows, shorter, ROUND_STEPS)
             if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + ALLOWANCE:
                 scene = shorter
                 continue
@@ -106,7 +106,7 @@ def _wall_tolerance(sources: Tensor) -> Tensor:
     return WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + LEAST_M
 
 
-def orthogonal_walls(scene: Scene) -> Tensor | None:
+def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     """Return the fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
 
     Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
@@ -164,7 +164,7 @@ def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
     return float(worth.amax(1).sum())
 
 
-def reassign(scene: Scene, walls: Tensor) -> Scene:
+def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     """Return new sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
     tolerance = 2.5 * _wall_tolerance(sources)
@@ -190,7 +190,7 @@ def reassign(scene: Scene, walls: Tensor) -> Scene:
     return explained.only(list(range(len(ids))))
 
 
-def prune(rows: Rows, scene: Scene, least: float) -> Scene:
+def prune_sources(rows: Rows, scene: Scene, least: float) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior, kept = Posterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):

@@ -76,7 +76,7 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
     return array if site.rx_rotation is None else array @ np.asarray(site.rx_rotation, np.float64).T
 
 
-def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
+def antenna_positions(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
     """Return places (S, E, 3) [m] of antennas at positions (S, 3); E = 1 where the geometry is unknown.
 
     Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
@@ -100,10 +100,14 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
         moving = position[:, None].expand(-1, len(array), -1)
         return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
     # Antennas of a static receiver without a known array are outputs at the transmitter's place.
-    return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
+    return (
+        position[:, None]
+        if site.static_end == "rx"
+        else antenna_positions(site, position, rotation, antennas)
+    )
 
 
-def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
+def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """Return at most `limit` rows from the given measurements.
 
     Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
@@ -168,7 +172,7 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
     return ranges(position, sources)
 
 
-def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
+def bounding_box(rows: Rows, transmitter: Tensor) -> Tensor:
     """Return the lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
     places = torch.cat([rows.position, transmitter[None]])
     return torch.stack([places.amin(0), places.amax(0)])

@@ -45,7 +45,7 @@ class KernelVisibility:
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared(directions(moving_end(places), source)) / self.angle**2
+        squared = _squared(unit_vectors(moving_end(places), source)) / self.angle**2
         if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
         squared = squared + _squared(places).float() / self.length**2
@@ -124,7 +124,7 @@ class Scene:
         return [i for i in range(len(self.planes)) if (i,) in self.sequences]
 
     @property
-    def turns(self) -> Tensor:
+    def phase_factors(self) -> Tensor:
         """(K,) complex64 of size 1, the phases."""
         assert self.phase is not None
         return torch.polar(torch.ones(()), self.phase)
@@ -139,23 +139,23 @@ class Scene:
         """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
-    def unobstructed(self, rows: Rows) -> Tensor:
+    def unobstructed_waves(self, rows: Rows) -> Tensor:
         """Return waves (n, K) complex64 of sources at every row, turned by phases, without clutter."""
-        waves = steering(rows, self.images(rows))
-        return waves if self.phase is None else waves * self.turns
+        waves = spherical_waves(rows, self.images(rows))
+        return waves if self.phase is None else waves * self.phase_factors
 
     def waves(self, rows: Rows) -> Tensor:
         """Return the same, attenuated by clutter."""
-        return self.unobstructed(rows) * self.visible_share(rows.position)
+        return self.unobstructed_waves(rows) * self.visible_share(rows.position)
 
-    def longer(self, order: int) -> list[Reflections]:
+    def longer_sequences(self, order: int) -> list[Reflections]:
         """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
         indices = range(len(self.planes))
         more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
         known = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
-    def over(self, sequences: Iterable[Reflections]) -> Scene:
+    def with_other_sequences(self, sequences: Iterable[Reflections]) -> Scene:
         """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
@@ -180,12 +180,12 @@ class Scene:
             planes=self.planes[used],
             sequences=tuple(tuple(new[index] for index in sequence) for sequence in sequences),
             log_amplitude=self.log_amplitude[indices],
-            clutter=self.clutter.renamed(new),
+            clutter=self.clutter.with_planes_renumbered(new),
             phase=None if self.phase is None else self.phase[indices],
         )
 
 
-def steering(rows: Rows, sources: Tensor) -> Tensor:
+def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
     """Return the spherical waves (n, K) complex64 of sources at every row.
 
     Args:
@@ -204,16 +204,16 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
     """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
-    waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
+    waves = spherical_waves(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
 
 
-def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
+def visibility_correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
     """Return visibility correlations (K, n, n) float32."""
     return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
-def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+def unit_vectors(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
     return normalize(places - sources[..., None, :], dim=-1).to(dtype)
 

@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.terms import no_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.draws import draw_in_box
-from gsparc.physics.lags import Lags
+from gsparc.physics.lags import SpectrumLags
 
 SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
 BEST_PART = 8  # one in this many candidates may be a source
@@ -59,7 +59,7 @@ def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
+def nonnegative_powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     """Return the power (n, K), none negative, of each source at each receiver.
 
     Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate descent from
@@ -80,14 +80,14 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     return power
 
 
-def mixture(power: Tensor, atoms: Tensor) -> Tensor:
+def mix_lags(power: Tensor, atoms: Tensor) -> Tensor:
     """Return lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
 
 def find_sources(
-    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
-    settings: SearchSettings, seed: int, over: Callable[[], bool],
+    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
+    grid: SphereGrid, settings: SearchSettings, seed: int, over: Callable[[], bool],
 ) -> Tensor:  # fmt: skip
     """Return positions (K, 3) float32 [m] of sources.
 
@@ -111,7 +111,7 @@ def find_sources(
     def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.atoms(bearings(sources, receivers, rotation))
-        return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
+        return lags - mix_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
     positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
@@ -186,7 +186,7 @@ def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
 MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
 
 
-def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
+def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
     """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
     residual = {}
     for exponent in (2, 1):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.target_rows import TINY_POWER
-from gsparc.models.uplink.interface import power
+from gsparc.models.uplink.interface import mean_power
 from gsparc.models.uplink.search import Sources
 from gsparc.physics.plane_waves import Aperture
 
@@ -17,7 +17,7 @@ LEAST = 1e-9  # of a feature: a logarithm is taken
 
 
 @dataclass(frozen=True)
-class SearchResult:
+class SearchedSnapshots:
     """Snapshots and the sources found in them.
 
     Attributes:
@@ -39,7 +39,7 @@ class SearchResult:
         and delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
         """
         sources = self.sources
-        heard, strength = power(self.uplink), sources.gain.abs().square()
+        heard, strength = mean_power(self.uplink), sources.gain.abs().square()
         total = strength.sum(1).clamp_min(TINY_POWER)
         turns = 2 * math.pi * aperture.tones.abs().max()
         # An unknown phase costs no more than the source's power, which a first order does not know.
@@ -49,14 +49,14 @@ class SearchResult:
         middle = (share * sources.delay).sum(1, keepdim=True)
         columns = [
             self.noise / heard,
-            power(self.residual) / self.noise.clamp_min(TINY_POWER),
+            mean_power(self.residual) / self.noise.clamp_min(TINY_POWER),
             sources.error_variance(aperture) / heard,
             (delay_error + gain_variance) / heard,
             total / heard,
             1 / share.square().sum(1),
             (share * (sources.delay - middle) ** 2).sum(1).sqrt(),
             gain_variance / heard,
-            power(mean) / heard,
+            mean_power(mean) / heard,
             torch.full_like(heard, mean[0].numel()),
         ]
         return torch.stack([column.clamp_min(LEAST).log10() for column in columns], 1)

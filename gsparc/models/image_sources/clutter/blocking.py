@@ -27,7 +27,7 @@ class Clutter:
 
     Attributes:
         boxes: (B, 6) float32 [m], lower then upper corners.
-        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `tangents`.
+        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `plane_tangents`.
         plane: Q indices of planes of the scene.
     """
 
@@ -58,7 +58,7 @@ class Clutter:
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
-    def renamed(self, new: dict[int, int]) -> Clutter:
+    def with_planes_renumbered(self, new: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
         patches = [i for i, plane in enumerate(self.plane) if plane in new]
         return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
@@ -88,13 +88,13 @@ class Obstacles:
         used, self.boxes, self.patches = planes[plane], clutter.boxes, clutter.patches
         normal, offset = (part.float() for part in normal_form(used))
         self.plane, self.offset = plane.view(-1, 1, 1, 1), offset.view(-1, 1, 1, 1)
-        self.axes = torch.cat([normal[None], tangents(used)])
+        self.axes = torch.cat([normal[None], plane_tangents(used)])
 
     def visible_share(self, paths: Paths) -> Tensor:
         """Return the visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
-            seen = seen * past_boxes(paths, self.boxes).prod(0)
+            seen = seen * share_past_boxes(paths, self.boxes).prod(0)
         if len(self.patches):
             seen = seen * self._past_patches(paths)
         return seen
@@ -117,7 +117,7 @@ class Obstacles:
         return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
 
 
-def past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
+def share_past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
     """Return the share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
     along = torch.where(along.abs() < EDGE, EDGE, along)
@@ -133,7 +133,7 @@ def past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
     return torch.where(paths.valid, passed, 1.0)
 
 
-def within(points: Tensor, patches: Tensor) -> Tensor:
+def share_inside_patches(points: Tensor, patches: Tensor) -> Tensor:
     """Return the soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
     return _inside([points[None, ..., 0], points[None, ..., 1]], patches)
 
@@ -146,7 +146,7 @@ def _inside(place: list[Tensor], patches: Tensor) -> Tensor:
     return torch.sigmoid(inner / SOFT)
 
 
-def tangents(planes: Tensor) -> Tensor:
+def plane_tangents(planes: Tensor) -> Tensor:
     """Return two unit axes (2, ..., 3) float32 along planes (..., 4): level where they can be."""
     normal = normal_form(planes)[0].float()
     up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])

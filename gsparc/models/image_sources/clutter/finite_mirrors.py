@@ -14,11 +14,11 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import tangents, within
-from gsparc.models.image_sources.clutter.boxes import evolve
-from gsparc.models.image_sources.clutter.residual import Unexplained
+from gsparc.models.image_sources.clutter.blocking import plane_tangents, share_inside_patches
+from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
+from gsparc.models.image_sources.clutter.residual import UnexplainedRows
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.physics.draws import draw_in_box, draw_sides
 from gsparc.physics.mirror_planes import normal_form, reflect
 from gsparc.physics.waves import LIGHT
@@ -40,18 +40,18 @@ BLOCK_CELLS = 1e6  # of the rasters held at a time, four numbers each
 MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
-def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
+def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]:
     """Return the patch (4,) on a plane that explains most if sequences end on it alone, and its nats."""
-    mine = [k for k, sequence in enumerate(left.scene.sequences) if number in sequence]
-    few, waves = left.paths.take(mine), left.waves[:, mine]
-    along = tangents(left.scene.planes[number])
-    met, here = few.end @ along.T, few.plane == number
-    ends = left.room @ along.T
+    mine = [k for k, sequence in enumerate(unexplained.scene.sequences) if plane in sequence]
+    few, waves = unexplained.paths.take(mine), unexplained.waves[:, mine]
+    along = plane_tangents(unexplained.scene.planes[plane])
+    met, here = few.end @ along.T, few.plane == plane
+    ends = unexplained.room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
     def score(patches: Tensor) -> Tensor:
-        return left.scorer.score_shares(
-            patches, lambda part: torch.where(here, within(met, part), 1.0).prod(-1), waves
+        return unexplained.scorer.gain_of_shares(
+            patches, lambda part: torch.where(here, share_inside_patches(met, part), 1.0).prod(-1), waves
         )
 
     def repaired(patches: Tensor) -> Tensor:
@@ -59,11 +59,11 @@ def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
         lower = torch.minimum(lower, upper - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
-    middle = draw_in_box(low, high, DRAWS, left.generator)
-    side = draw_sides(SMALLEST, LARGEST, middle, left.generator)
+    middle = draw_in_box(low, high, DRAWS, unexplained.generator)
+    side = draw_sides(SMALLEST, LARGEST, middle, unexplained.generator)
     starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[score(starts).topk(8).indices]
-    return evolve(starts, score, repaired, left.generator, rounds=10)
+    return maximise_by_evolution(starts, score, repaired, unexplained.generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class SmallMirror:
     patch: Tensor
     score: float
 
-    def same(self, other: SmallMirror, apart: float) -> bool:
+    def overlaps(self, other: SmallMirror, apart: float) -> bool:
         """Whether both are parallel, closer than `apart` [m] and overlap."""
         (normal, offset), (normal2, offset2) = map(normal_form, (self.plane, other.plane))
         if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > apart:
@@ -89,7 +89,7 @@ class SmallMirror:
         return bool((high > low).all())
 
 
-def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
+def find_small_mirrors(unexplained: UnexplainedRows, most: int) -> list[SmallMirror]:
     """Return at most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
@@ -97,7 +97,7 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
     """
-    rows, room, known = left.rows, left.room, left.scene.planes[left.scene.walls]
+    rows, room, known = unexplained.rows, unexplained.room, unexplained.scene.planes[unexplained.scene.walls]
     wavelength = LIGHT / float(rows.frequency.mean())
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
@@ -112,14 +112,14 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
         )
         candidates = torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1)
         many = 1 + 2 * len(known)
-        count = math.prod(_cells(room, tangents(candidates[0]), CELL)) * many * len(candidates)
+        count = math.prod(_cells(room, plane_tangents(candidates[0]), CELL)) * many * len(candidates)
         if count > MAX_CELLS:
             log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
             continue
         cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
-        each = max(math.prod(_cells(room, tangents(candidates[0]), cell)), len(rows)) * many
+        each = max(math.prod(_cells(room, plane_tangents(candidates[0]), cell)), len(rows)) * many
         blocks = candidates.split(max(1, int(BLOCK_CELLS / each)))
-        parts = [_raster(left, block, known, cell) for block in blocks]
+        parts = [_raster(unexplained, block, known, cell) for block in blocks]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
@@ -129,17 +129,19 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
 def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
     apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(mirror.same(other, least) for other in apart):
+        if not any(mirror.overlaps(other, least) for other in apart):
             apart.append(mirror)
     return apart
 
 
-def _raster(left: Unexplained, candidates: Tensor, known: Tensor, cell: float) -> tuple[Tensor, Tensor]:
+def _raster(
+    unexplained: UnexplainedRows, candidates: Tensor, known: Tensor, cell: float
+) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
-    along = tangents(candidates[0])
-    low, cells = (left.room @ along.T).amin(0), _cells(left.room, along, cell)
-    tables, alpha, scale = [], left.scorer.alpha, left.scorer.scale
-    for arriving, met in _sources(left.rows, left.scene.transmitter, candidates, known):
+    along = plane_tangents(candidates[0])
+    low, cells = (unexplained.room @ along.T).amin(0), _cells(unexplained.room, along, cell)
+    tables, alpha, scale = [], unexplained.scorer.alpha, unexplained.scorer.scale
+    for arriving, met in _sources(unexplained.rows, unexplained.scene.transmitter, candidates, known):
         raise_if_cancelled()
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
@@ -188,7 +190,7 @@ def _sources(
         first = _meeting(places, before, wall.expand_as(candidates))
         meetings.append(_meeting(first, once, candidates))
     sources = _images(rows.static_ends(transmitter), candidates, known)
-    return [(steering(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
+    return [(spherical_waves(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
 
 
 def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
-from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images, normal_form
 from gsparc.processes.trend import Walls
@@ -62,7 +62,7 @@ class Mirrors:
         patches: list[Tensor] = []
         indices: list[int] = []
         for number, (_, members) in enumerate(grouped):
-            along = tangents(planes[number]).double()
+            along = plane_tangents(planes[number]).double()
             for part in _touching(members):
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
@@ -74,7 +74,7 @@ class Mirrors:
         plane = tuple(indices[i] for i in top)
         return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
 
-    def mirroring(self, smallest: float) -> list[int]:
+    def large_planes(self, smallest: float) -> list[int]:
         """Return numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
 
         Others only block.
@@ -107,7 +107,7 @@ class Mirrors:
         candidates = [
             sequence
             for length in range(1, order + 1)
-            for sequence in all_sequences(indices[: affordable(len(indices), length)], length)
+            for sequence in all_sequences(indices[: most_mirrors(len(indices), length)], length)
             if len(sequence) == length
         ]
         sequences = _distinct(candidates, transmitter, self.planes)
@@ -128,7 +128,9 @@ class Mirrors:
             best = best[power.argsort(descending=True)]
         return ((), *(sequences[i] for i in best[: most - 1].tolist()))
 
-    def hiding(self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor) -> Clutter:
+    def obstacles_of(
+        self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor
+    ) -> Clutter:
         """Return the rectangles that mirror sequences or that hide one from a place, and the boxes."""
         clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
         used = {index for sequence in sequences for index in sequence}
@@ -159,7 +161,7 @@ class Mirrors:
         for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):
             here = paths.plane == plane
             if bool(here.any()):
-                met = paths.end[here] @ tangents(self.planes[plane]).T
+                met = paths.end[here] @ plane_tangents(self.planes[plane]).T
                 inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
         return (inside.all(-1) & paths.valid).float()
 
@@ -168,13 +170,13 @@ class Mirrors:
         return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
 
 
-def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
+def walls_of_file(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
     normal, offset = normal_form(planes)
-    axes = torch.cat([normal[None], tangents(planes).double()]).movedim(0, 1)
+    axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
     end = torch.from_numpy(np.zeros(0) if still is None else still).double()
     return Walls(axes, corners, _sides(patches), end)
@@ -212,7 +214,7 @@ def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     return [corners[group[face] == number] for number in range(count)]
 
 
-def affordable(mirrors: int, length: int) -> int:
+def most_mirrors(mirrors: int, length: int) -> int:
     """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
@@ -236,7 +238,7 @@ def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor)
     return [sequences[i] for i in sorted(distinct)]
 
 
-def start_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
+def initial_log_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
     """Log amplitudes (K,) float32 to start from, given the direct wave's amplitude."""
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     return math.log(direct) + order * math.log(REFLECTED)
