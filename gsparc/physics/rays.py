@@ -1,21 +1,10 @@
-"""Geometry of rays: their directions, and where two of them pass each other."""
+"""Geometry of rays: where two of them pass each other."""
 
 from __future__ import annotations
 
 import numpy as np
 
 MIN_ANGLE = 0.02  # [rad]: more parallel rays have no well-defined crossing
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (..., D) of length 1; one of zeros stays.
-
-    >>> unit(np.array([[3.0, 4.0], [0.0, 0.0]]))
-    array([[0.6, 0.8],
-           [0. , 0. ]])
-    """
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(length, np.finfo(float).tiny)
 
 
 def closest_approach(

@@ -19,11 +19,11 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
-from gsparc.models.directional.posterior import GainKernel, SightedSources
+from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_phase_and_static_end
-from gsparc.models.image_sources.rows import draw_rows
+from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
@@ -33,7 +33,7 @@ from gsparc.training.time_budget import TimeBudget
 MIN_SEEN = 2  # receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
 MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
 REFINEMENT_ROWS = 400  # rows used for position refinement
-REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # meanwhile
+REFINEMENT_KERNEL = GainKernel(CONSTANTS[1], LENGTHS_M[1], NOISES[1])  # meanwhile
 VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
 
 
@@ -49,8 +49,8 @@ class DirectionalGP(SourcesInFrame):
     posterior: SightedSources
 
     def __init__(self, rows: int = SearchSettings.rows, seed: int = 0) -> None:
-        if rows < 8:
-            raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
+        if rows < LEAST_ROWS:
+            raise ValueError(f"directional_gp: rows must be at least {LEAST_ROWS}, got {rows}")
         self.row_limit, self.seed = rows, seed
 
     # ---- the search ----

@@ -26,6 +26,7 @@ from gsparc.models.directional.triangulation import SAME_SIGMAS
 from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
+from gsparc.models.image_sources.search import NOISE
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
@@ -38,7 +39,7 @@ REFINED, STEPS = 6, 8  # best draws, and Gauss-Newton steps for each
 MIN_PROBABILITY = 0.8  # of one optimum, to resolve a source
 SWEEPS = 8  # over all sources
 TOLERANCE_M = 1e-3  # [m], largest move of a sweep that ends the refinement
-NOISE, MIN_NOISE = 0.1, 1e-3  # of the rows' power
+MIN_NOISE = 1e-3  # of the rows' power
 POWER_UPDATES, MAX_RATIO = 3, 8.0  # fixed-point iterations, and largest change in each
 MAX_POWER = 4.0  # of a source, times the median
 TINY = 1e-9  # of a power: one of 0 would stay 0 for ever, as every update is proportional to it
@@ -234,10 +235,8 @@ class ConditionalLikelihood:
             tried = points + step_scale[:, None] * step
             log_posterior = self.log_posterior(tried)
             better = log_posterior > best
-            points, best = (
-                torch.where(better[:, None], tried, points),
-                torch.where(better, log_posterior, best),
-            )
+            points = torch.where(better[:, None], tried, points)
+            best = torch.where(better, log_posterior, best)
             step_scale = torch.where(better, 1.0, step_scale / 3)
         return points, self._step(points)[1]
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.physics.rays import closest_approach, unit
+from gsparc.physics.rays import closest_approach
 
 MIN_ERROR, MAX_ERROR = 1e-4, 0.12  # [rad], of a direction: rounding in files; no position information
 ERRORS = tuple(np.geomspace(MIN_ERROR, MAX_ERROR, 7))  # [rad], tried on the first point
@@ -54,7 +54,8 @@ class Rays:
     def of(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
         """Gather one array (paths, 3) per receiver."""
         flat = np.concatenate([places[:0], *rays])
-        return Rays(places, unit(flat), np.repeat(np.arange(len(rays)), [len(r) for r in rays]))
+        flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), np.finfo(float).tiny)
+        return Rays(places, flat, np.repeat(np.arange(len(rays)), [len(r) for r in rays]))
 
     def __len__(self) -> int:
         return len(self.owner)

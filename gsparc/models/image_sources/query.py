@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 from functools import cached_property
 
 import torch
@@ -47,14 +48,12 @@ class EnsembleMeans:
         self.counts = [len(scene.sequences) for scene in scenes]
         self.sources = torch.cat([scene.sources for scene in scenes])
         self.orientations = torch.cat([image_rotations(scene.planes, scene.sequences) for scene in scenes])
-        kernels = [scene.visibility for scene in scenes]
+        numbers = torch.tensor([astuple(scene.visibility) for scene in scenes], dtype=torch.float64)
+        each = torch.repeat_interleave(numbers, torch.tensor(self.counts), 0)[:, :, None, None]
+        constant, angle, length = each.unbind(1)
         # |u - v|^2 of unit vectors is 2 - 2 u.v.
-        numbers = [
-            (float(k.constant), 2 * MATERN32 / float(k.angle) ** 2, MATERN32 / float(k.length) ** 2)
-            for k in kernels
-        ]
-        each = torch.repeat_interleave(torch.tensor(numbers), torch.tensor(self.counts), 0)
-        constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
+        self.by_angle = (2 * MATERN32 / angle**2).float()
+        self.by_length, constant = (MATERN32 / length**2).float(), constant.float()
         toward = unit_vectors(moving_end(self.places), self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
         # Not at the first query, which may be for inference alone.

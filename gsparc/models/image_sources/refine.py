@@ -11,14 +11,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import (
-    BETAS,
-    KernelVisibility,
-    Scene,
-    spherical_waves,
-    visibility_correlations,
-)
-from gsparc.physics.mirror_planes import images
+from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene
 from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
@@ -31,8 +24,7 @@ NORMAL_STEP, OFFSET_STEP = 0.0012, 0.004  # of a plane's unit normal, and along 
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-# Negative log prior [nats] of transmitter, planes (P, 4), log amplitudes (K,), log noise and phases (K,).
-Cost = Callable[[list[Tensor]], Tensor]
+Cost = Callable[[Scene], Tensor]  # negative log prior [nats] of a scene
 
 
 def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
@@ -42,71 +34,67 @@ def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None)
         rows: measurements.
         scene: the start; its phases move where gains have them.
         steps: at least 0.
-        cost: a negative log prior, added to the negative log likelihood.
+        cost: of planes, log amplitudes and phases, added to the negative log likelihood.
     """
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
-    values += [] if scene.phase is None else [scene.phase]
-    normal, offset = scene.planes.split((3, 1), 1)
-    plane_steps = torch.cat([torch.full_like(normal, NORMAL_STEP), torch.full_like(offset, OFFSET_STEP)], 1)
-    rates: list[Tensor | float] = [TRANSMITTER_STEP, plane_steps, *[STEP] * (len(values) - 2)]
-    first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
-    best, lowest, correlation = values, math.inf, torch.empty(0)
+    values = [scene.transmitter, *scene.planes.split((3, 1), 1)]
+    values += [scene.log_amplitude, torch.tensor(scene.log_noise)]
+    values = [v.clone() for v in (*values, *([] if scene.phase is None else [scene.phase]))]
+    rates = [TRANSMITTER_STEP, NORMAL_STEP, OFFSET_STEP, STEP, STEP, STEP]
+    groups = [{"params": [v], "lr": rate} for v, rate in zip(values, rates, strict=False)]
+    optimizer = torch.optim.Adam(groups, betas=BETAS, eps=1e-9)
+    best, lowest, correlation = scene, math.inf, torch.empty(0)
     for step in range(steps + 1):
+        if step == math.ceil(DECAY_AFTER * steps):
+            for group in optimizer.param_groups:
+                group["lr"] *= DECAY
         if step % REFRESH == 0:
-            correlation = visibility_correlations(
-                rows, images(values[0], values[1], scene.sequences), scene.visibility
+            seen = (
+                scene.visibility.correlation(rows.places, one) for one in _scene_at(scene, values).sources
             )
-        value, gradient = _likelihood(rows, scene, values, correlation)
-        if cost is not None:
-            leaves = [v.detach().requires_grad_() for v in values]
-            with torch.enable_grad():
-                more = cost(leaves)
-                slopes = torch.autograd.grad(more, leaves, materialize_grads=True)
-            value, gradient = value + more.item(), [g + s for g, s in zip(gradient, slopes, strict=True)]
+            correlation = torch.stack([*seen])
+        value, gradient = _objective(rows, scene, values, correlation, cost)
         if value < lowest:
-            lowest, best = value, values
+            lowest, best = value, _scene_at(scene, [v.clone() for v in values])
         if step == steps or late():
             break
-        decay = 1.0 if step < DECAY_AFTER * steps else DECAY
-        moved = []
-        for i, g in enumerate(gradient):
-            first[i] = BETAS[0] * first[i] + (1 - BETAS[0]) * g
-            second[i] = BETAS[1] * second[i] + (1 - BETAS[1]) * g * g
-            mean = first[i] / (1 - BETAS[0] ** (step + 1))
-            size = (second[i] / (1 - BETAS[1] ** (step + 1))).sqrt() + 1e-9
-            moved.append(values[i] - decay * rates[i] * mean / size)
-        values = moved
-    transmitter, planes, log_amplitude, log_noise, *phase = best
+        for v, slope in zip(values, gradient, strict=True):
+            v.grad = slope
+        optimizer.step()
+    return best
+
+
+def _scene_at(scene: Scene, values: list[Tensor]) -> Scene:
+    """The scene of other transmitter, normals, offsets, log amplitudes, log noise and phases, if any."""
+    transmitter, normal, offset, log_amplitude, log_noise, *phase = values
     return replace(
-        scene, transmitter=transmitter, planes=planes, log_amplitude=log_amplitude,
-        log_noise=float(log_noise), phase=phase[0] if phase else None,
+        scene, transmitter=transmitter, planes=torch.cat([normal, offset], 1), log_amplitude=log_amplitude,
+        log_noise=log_noise.item(), phase=phase[0] if phase else None,
     )  # fmt: skip
 
 
-def _likelihood(
-    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor
+def _objective(
+    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
 ) -> tuple[float, list[Tensor]]:
-    """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
-    transmitter, planes, log_amplitude, log_noise, *phases = values
-    transmitter, planes, *phases = (v.detach().requires_grad_() for v in (transmitter, planes, *phases))
-    amplitude, noise = log_amplitude.exp(), log_noise.exp()
-    waves = spherical_waves(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
-    for phase in phases:
-        waves = waves * torch.polar(torch.ones(()), phase)
-    waves = waves * scene.visible_share(rows.position)
-    scaled = waves.detach() * amplitude
-    gains = Posterior(rows, scene).gains()
+    """Negative log likelihood and prior, and derivatives by the values: `d nll = trace(G dK)`."""
+    leaves = [v.detach().requires_grad_() for v in values]
+    moved = _scene_at(scene, leaves)
+    waves = moved.unobstructed_waves(rows) * scene.visible_share(rows.position)
+    amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
+    scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
     conditioned = gains.condition(noise + scene.noise_floor)
     by_waves = gains.slope_by_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
-    leaves = [transmitter, planes, *phases]
-    by_place, by_plane, *by_phase = torch.autograd.grad(
-        waves, leaves, by_waves * amplitude, materialize_grads=True
-    )
+    slopes = torch.autograd.grad(waves, leaves, by_waves * amplitude, materialize_grads=True)
+    by_place, by_normal, by_offset, _, _, *by_phase = slopes
     by_noise = noise * gains.slope_by_noise(conditioned.slope)
-    return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
+    gradient = [by_place, by_normal, by_offset, by_amplitude, by_noise, *by_phase]
+    if cost is None:
+        return conditioned.nll, gradient
+    more = cost(moved)
+    by_cost = torch.autograd.grad(more, leaves, materialize_grads=True)
+    return conditioned.nll + more.item(), [g + s for g, s in zip(gradient, by_cost, strict=True)]
 
 
 def learn_visibility(

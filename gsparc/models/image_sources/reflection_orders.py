@@ -25,7 +25,7 @@ ALLOWANCE = 10.0  # nats that may be lost with a plane
 ORDER = 3  # largest number of reflections of a source
 WALL_TOLERANCE, LEAST_M = 0.03, 0.02  # of a source's distance from the transmitter, plus [m], to an image
 NEAR_SEQUENCE_M = 0.06  # [m], to that in perpendicular ones, plus 1 % of the distance
-MOST_WALLS, MOST_ORTHOGONAL = 10, 8
+MOST_WALLS = 10
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
@@ -52,7 +52,7 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     candidates = [sequence for sequence in all_sequences(indices, order) if sequence not in rest]
     if not candidates or not users:
         return None
-    distance = _distances(scene, candidates, scene.sources[users], LENGTH_PENALTY_M)
+    distance = _distances(scene, candidates, scene.sources[users])
     nearest = distance.argmin(1).tolist()
     strength = (
         scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
@@ -69,11 +69,11 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     return replace(scene, sequences=tuple(sequences)).only(sorted(numbers))
 
 
-def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_reflection: float) -> Tensor:
+def _distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
     """Distances (places, sequences) [m], plus a penalty on the order."""
     position = images(scene.transmitter, scene.planes, sequences)
     order = torch.tensor([len(sequence) for sequence in sequences])
-    return (position[None] - places[:, None]).norm(dim=-1) + per_reflection * order
+    return (position[None] - places[:, None]).norm(dim=-1) + LENGTH_PENALTY_M * order
 
 
 def find_walls(sources: Tensor) -> Tensor | None:
@@ -130,7 +130,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
         offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
         candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
     chosen, explained = scene.planes[:0], 1.0
-    for _ in range(MOST_ORTHOGONAL):
+    for _ in range(MOST_WALLS):
         tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
         gains = [_explained(scene, planes, allowed) for planes in tried]
         if not gains or max(gains) < explained + 0.8:
@@ -170,11 +170,11 @@ def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     tolerance = 2.5 * _wall_tolerance(sources)
     base = replace(scene, planes=walls)
     candidates = all_sequences(list(range(len(walls))), ORDER)
-    distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
+    distance = _distances(base, candidates, sources)
     planes, ids, assigned = [*walls], [0], set()
     sequences: list[Reflections] = [()]
     for i in range(1, len(sources)):
-        near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
+        near = [j for j in distance[i].argsort().tolist() if distance[i, j] < tolerance[i]]
         free = next((candidates[j] for j in near if candidates[j] not in assigned), None)
         if free is not None:
             assigned.add(free)

@@ -19,6 +19,9 @@ from gsparc.physics.waves import ranges
 A = TypeVar("A", Tensor, np.ndarray)
 
 
+LEAST_ROWS = 8  # that a search may be limited to
+
+
 @dataclass(frozen=True)
 class Rows:
     """n complex numbers per output, each at one place and one frequency.

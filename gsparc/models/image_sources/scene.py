@@ -146,7 +146,8 @@ class Scene:
 
     def waves(self, rows: Rows) -> Tensor:
         """Return the same, attenuated by clutter."""
-        return self.unobstructed_waves(rows) * self.visible_share(rows.position)
+        waves = spherical_waves(rows, self.images(rows)) * self.visible_share(rows.position)
+        return waves if self.phase is None else waves * self.phase_factors
 
     def longer_sequences(self, order: int) -> list[Reflections]:
         """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
@@ -206,11 +207,6 @@ def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
     """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
     waves = spherical_waves(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
-
-
-def visibility_correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
-    """Return visibility correlations (K, n, n) float32."""
-    return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
 def unit_vectors(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:

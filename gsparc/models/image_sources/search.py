@@ -25,7 +25,7 @@ from gsparc.models.image_sources.refine import (
     learn_visibility,
     refine_scene,
 )
-from gsparc.models.image_sources.rows import Rows, bounding_box
+from gsparc.models.image_sources.rows import LEAST_ROWS, Rows, bounding_box
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
@@ -62,8 +62,8 @@ class SearchSettings(Checked):
     """
 
     searches: int = setting(6, whole(1))
-    search_rows: int = setting(700, whole(8))
-    rows: int = setting(3000, whole(8))
+    search_rows: int = setting(700, whole(LEAST_ROWS))
+    rows: int = setting(3000, whole(LEAST_ROWS))
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
     order: int = setting(orders.ORDER, whole(0))

@@ -19,8 +19,8 @@ from gsparc.processes.factor import Factor
 
 LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
 UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
-LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction of a resolution cell
-REACH = (0.03, 0.006)  # prior standard deviation of a step: half a step of the grid
+REACH = (0.03, 0.006)  # prior standard deviation of a step of cosines, and of delays: half a step of the grid
+LARGEST = 2  # of these deviations, that a step may have
 
 
 def repeat_per_coordinate(gain: Tensor) -> Tensor:
@@ -178,8 +178,8 @@ class SourceSearch:
         reach = self._reach(n)
         factor = Factor.of(self._scaled(fit, noise), "ignore")
         step = factor.solved((fit.slope * reach)[..., None])[..., 0] * reach
-        turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
-        return turned, step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
+        step = step.clamp(-LARGEST * reach, LARGEST * reach)
+        return step[:, : 2 * n].view(-1, 2, n).transpose(1, 2), step[:, 2 * n :]
 
     def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
         """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""

@@ -14,7 +14,6 @@ from gsparc.models.image_sources.scene import (
     KernelVisibility,
     Scene,
     spherical_waves,
-    visibility_correlations,
 )
 from gsparc.processes.kernel import matern32_of_squares
 
@@ -92,19 +91,20 @@ def test_left_out_by_refitting_without_the_receiver(quadrature):
 @pytest.mark.parametrize("make", [_scene, _phased])
 def test_slopes_of_the_likelihood_which_refining_raises(make):
     rows, scene = _rows(), make()
-    seen = visibility_correlations(rows, scene.sources, scene.visibility)
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
+    seen = torch.stack([scene.visibility.correlation(rows.places, source) for source in scene.sources])
+    values = [scene.transmitter, *scene.planes.split((3, 1), 1), scene.log_amplitude]
+    values += [torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
-    nll, gradient = refine._likelihood(rows, scene, values, seen)
+    nll, gradient = refine._objective(rows, scene, values, seen)
     assert nll == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
     for i, value in enumerate(values):
-        step = 3e-4 if i < 2 else 2e-2
+        step = 3e-4 if i < 3 else 2e-2
         for j in range(min(value.numel(), 4)):
             ends = []
             for sign in (1, -1):
                 moved = [v.clone() for v in values]
                 moved[i].view(-1)[j] += sign * step
-                ends.append(refine._likelihood(rows, scene, moved, seen)[0])
+                ends.append(refine._objective(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
     assert Posterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll

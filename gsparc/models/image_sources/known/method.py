@@ -70,9 +70,10 @@ class KnownWallsGP(ImageSourceGP):
         rows = row_sets[0]
         given = self._scene(rows, settings)
 
-        def cost(values: list[Tensor]) -> Tensor:
-            near = walls_prior_cost(given.planes, given.sequences, values[1], values[2])
-            return near + prior.cost(values[4], given.sequences)
+        def cost(moved: Scene) -> Tensor:
+            assert moved.phase is not None
+            near = walls_prior_cost(given.planes, given.sequences, moved.planes, moved.log_amplitude)
+            return near + prior.cost(moved.phase, given.sequences)
 
         with late_when(budget.over):
             scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
