@@ -40,7 +40,7 @@ def _keys(data, monkeypatch) -> dict[str, str]:
     found = {}
     rows = np.arange(len(data))
     with pytest.raises(Asked) as key_of_vectors:
-        vector_cache.recovered(data, rows)
+        vector_cache.recover_cached(data, rows)
     found["vectors"] = str(key_of_vectors.value)
     found["cells"] = content(data)
     return found

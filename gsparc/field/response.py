@@ -16,7 +16,7 @@ from gsparc.data.limits import Checked, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 from gsparc.ops.channels import channels
-from gsparc.physics.array_response import array_output, element_pattern, normalised, steering
+from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT
 
@@ -142,7 +142,7 @@ class ArrayResponse(nn.Module):
         if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
             known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
         image = self.renderer(known).flatten(1)
-        return normalised(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
+        return normalise_spectrum(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
 
     def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
         """Return spectra (B, H, W) of composited fields (B, 2, H, W) and unknown shares (B,)."""

@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 from gsparc.data.moments import Snapshots, moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.physics.row_factors import Freedom, turning, words
+from gsparc.physics.row_factors import Freedom, alignment_factors, freedom_words
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel
 from gsparc.processes.nearest import weights_of
@@ -92,7 +92,7 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
     )
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
-        len(known), words(site.freedom), float(np.mean([one.error for one in found])),
+        len(known), freedom_words(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
     turned = replace(
@@ -183,7 +183,7 @@ class _Rows:
         if len(rest):
             next_to = cKDTree(self.places[trunk]).query(self.places[rest])[1]
             child, parent = np.r_[child, rest], np.r_[parent, trunk[next_to]]
-        steps = turning(values[child], values[parent], self.tones, self.freedom_of_phase)
+        steps = alignment_factors(values[child], values[parent], self.tones, self.freedom_of_phase)
         for row, onto, step in zip(child, parent, steps, strict=True):
             factors[row] = step * factors[onto]
         return factors
@@ -233,12 +233,12 @@ class _Rows:
     def _swept(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
             told = self._told(factors, weights)
-            factors = turning(self.values, told, self.tones, self.freedom_of_phase)
+            factors = alignment_factors(self.values, told, self.tones, self.freedom_of_phase)
         return factors
 
     def _error(self, factors: np.ndarray, weights: csr_array) -> float:
         told = self._told(factors, weights)
-        told = told * turning(told, self.values, self.tones, self.freedom)[:, None]
+        told = told * alignment_factors(told, self.values, self.tones, self.freedom)[:, None]
         missed = np.abs(self.values - told) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 

@@ -18,7 +18,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.physics.row_factors import turning
+from gsparc.physics.row_factors import alignment_factors
 from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def predictions(
     told = list(asked())
     moments, back = Snapshots.of(data, rows), np.argsort(order)
     means = moments.arranged(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
-    turns = turning(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    turns = alignment_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
     factors = torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
     for chosen, batch, said in told:
         factor = factors[chosen]

@@ -65,7 +65,7 @@ def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
     return _SafeAbsolute.apply(vectors @ matrix.conj())
 
 
-def normalised(image: Tensor, how: str) -> Tensor:
+def normalise_spectrum(image: Tensor, how: str) -> Tensor:
     """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1) or `none`.
 
     >>> normalised(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")
@@ -102,7 +102,7 @@ class _SafeAbsolute(torch.autograd.Function):
 
 
 @dataclass(frozen=True)
-class Lags:
+class CoArray:
     """The distinct element differences of an array, one of each pair +-d, the zero lag first.
 
     Attributes:
@@ -133,11 +133,11 @@ class Lags:
         return (whole + whole.transpose(1, 2)) / 2
 
 
-def lags(array: np.ndarray, wavelength: float) -> Lags:
+def co_array(array: np.ndarray, wavelength: float) -> CoArray:
     """Return the co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one.
 
     >>> square = np.stack([*np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))], -1).reshape(-1, 3)
-    >>> lags(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
+    >>> co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
     (25, 3)
     """
     array = np.asarray(array, dtype=np.float64)
@@ -166,4 +166,4 @@ def lags(array: np.ndarray, wavelength: float) -> Lags:
     differences = np.stack(
         [difference.reshape(-1, 3)[(which == i) & (sign >= 0)].mean(0) for i in range(len(unique))]
     )
-    return Lags(differences, torch.from_numpy(real), torch.from_numpy(imag), m)
+    return CoArray(differences, torch.from_numpy(real), torch.from_numpy(imag), m)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import lags
+from gsparc.physics.array_response import co_array
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
 NEGLIGIBLE = 1e-9  # harmonics this much weaker than the strongest are below float32's resolution
@@ -34,7 +34,7 @@ class SpectrumRenderer(nn.Module):
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float, background: Tensor) -> None:
         super().__init__()
-        known = lags(array, wavelength)
+        known = co_array(array, wavelength)
         # Half a turn of azimuth takes d.u to -d.u for elements in a plane: cosines stay, sines change sign.
         planar = float(np.ptp(array[:, 2])) < 1e-6 * wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0

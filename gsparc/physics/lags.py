@@ -11,14 +11,15 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import SphereGrid
-from gsparc.physics.separable import Separable, separable
+from gsparc.physics.array_response import co_array
+from gsparc.physics.separable import Separable, fit_separable
 
 BLOCK = 128  # images at once
 RIDGE = 1e-7  # of the mean energy: directions beyond the horizon leave some lags undetermined
 LOST = 1e-12  # of the energy of a lag's image in its separable form: a float32's rounding
 
 
-class Lags:
+class SpectrumLags:
     """The lags of an array on a grid.
 
     Args:
@@ -32,22 +33,19 @@ class Lags:
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
-        between = (array[:, None] - array[None]).reshape(-1, 3) / wavelength
-        unique, pairs = np.unique(np.round(between, 6), axis=0, return_counts=True)
-        # d and -d are conjugates: the half whose first coordinate other than zero is positive is enough
-        sign = np.array([next((np.sign(v) for v in row if v != 0), 0.0) for row in unique])
-        half = sign >= 0  # of sorted rows: the zero lag, which has no sine, is the first
-        differences = 2 * np.pi * unique[half]  # radians per unit of direction
-        self._differences = torch.from_numpy(differences.T.astype(np.float32))
-        self._share = torch.from_numpy((pairs[half] / len(array) ** 2).astype(np.float32))
-        self.count = 2 * len(self._share) - 1
+        known = co_array(array, wavelength)
+        differences = 2 * np.pi * np.round(known.difference / wavelength, 6)  # radians per unit of direction
+        self._differences = torch.from_numpy(differences.T).float()
+        # Of the pairs that are d apart, half are so the other way round.
+        pairs = known.real_pairs.sum(0)[: len(differences)]
+        pairs[1:] /= 2
+        self._share, self.count = (pairs / known.elements**2).float(), known.real_pairs.shape[1]
         angle = differences @ grid.directions().numpy().reshape(-1, 3).T
-        waves = np.concatenate([np.cos(angle), np.sin(angle[1:])])
+        waves = torch.from_numpy(np.concatenate([np.cos(angle), np.sin(angle[1:])]))
         # Of d and -d together: r e^(-j a) + conj(r) e^(j a) = 2 (Re r cos a + Im r sin a).
-        waves[1 : len(angle)] *= 2
-        waves[len(angle) :] *= 2
-        basis = torch.from_numpy(waves).reshape(self.count, grid.height, grid.width)
-        self.pixels = separable(basis.split(BLOCK), LOST)  # in float64
+        waves[1:] *= 2
+        basis = waves.reshape(self.count, grid.height, grid.width)
+        self.pixels = fit_separable(basis.split(BLOCK), LOST)  # in float64
         self._basis = self.pixels.of(basis.float())
         exact = self._basis.double()  # in float32, rounding would be most of the weakest lags
         gram = exact @ exact.T

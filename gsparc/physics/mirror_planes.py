@@ -11,8 +11,20 @@ from itertools import pairwise, product
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
+NO_PLANES = torch.zeros(0, 4, dtype=torch.float64)
 Reflections = tuple[int, ...]  # indices of planes, in the order in which they mirror
+
+
+def normal_form(planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit normals (..., 3) and offsets (..., 1) [m] of planes (..., 4), Hesse's normal form.
+
+    >>> normal_form(torch.tensor([0.0, 0.0, 2.0, 3.0]))
+    (tensor([0., 0., 1.]), tensor([3.]))
+    """
+    normal, offset = planes.split((3, 1), -1)
+    return normalize(normal, dim=-1), offset
 
 
 def reflect(points: Tensor, planes: Tensor) -> Tensor:
@@ -21,9 +33,8 @@ def reflect(points: Tensor, planes: Tensor) -> Tensor:
     >>> reflect(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))  # in the floor z = 0
     tensor([ 1.,  2., -3.])
     """
-    length = torch.linalg.vector_norm(planes[..., :3], dim=-1, keepdim=True)
-    normal = planes[..., :3] / length
-    height = (points * normal).sum(-1, keepdim=True) - planes[..., 3:]
+    normal, offset = normal_form(planes)
+    height = (points * normal).sum(-1, keepdim=True) - offset
     return points - 2 * height * normal
 
 
@@ -33,8 +44,7 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
     >>> bisector(torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 5.0]))  # z = 3
     tensor([0., 0., 1., 3.])
     """
-    offset = second - first
-    normal = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    normal = normalize(second - first, dim=-1)
     return torch.cat([normal, (normal * (first + second) / 2).sum(-1, keepdim=True)], -1)
 
 
@@ -59,7 +69,7 @@ def images(
     return place
 
 
-def orientations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
+def image_rotations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
     """Return orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
 
     One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.

@@ -40,7 +40,7 @@ class Aperture:
         return -2j * math.pi * self.tones
 
 
-def flat_places(array: np.ndarray, wavelength: float) -> Tensor:
+def planar_places(array: np.ndarray, wavelength: float) -> Tensor:
     """Return antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes.
 
     >>> flat_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()  # about the middle
@@ -69,8 +69,8 @@ class Columns:
     @staticmethod
     def of(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
         """Return columns of sources with direction cosines (B, N, 2) and delays (B, N)."""
-        over_antennas = steering(direction, aperture)[:, None]
-        over_tones = delays(delay, aperture)[:, None]
+        over_antennas = antenna_responses(direction, aperture)[:, None]
+        over_tones = tone_responses(delay, aperture)[:, None]
         by_cosine = over_antennas * aperture.cosine_slope
         by_delay = over_tones * aperture.delay_slope
         return Columns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
@@ -110,12 +110,12 @@ def phasor(turns: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
-def steering(direction: Tensor, aperture: Aperture) -> Tensor:
+def antenna_responses(direction: Tensor, aperture: Aperture) -> Tensor:
     """Return responses (B, N, A) complex of the antennas to direction cosines (B, N, 2)."""
     return phasor(direction @ aperture.places.T)
 
 
-def delays(delay: Tensor, aperture: Aperture) -> Tensor:
+def tone_responses(delay: Tensor, aperture: Aperture) -> Tensor:
     """Return responses (B, N, K) complex of the tones to delays (B, N) [turns per tone]."""
     return phasor(-delay[..., None] * aperture.tones)
 

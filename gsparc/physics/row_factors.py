@@ -18,7 +18,7 @@ MOST_DELAYS = 1024
 AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
-def words(freedom: Freedom) -> str:
+def freedom_words(freedom: Freedom) -> str:
     """Say in words what is free, for messages: `a phase and a delay`.
 
     >>> words("phase+delay+gain")
@@ -28,7 +28,7 @@ def words(freedom: Freedom) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
-def delays(tones: np.ndarray) -> np.ndarray:
+def resolvable_delays(tones: np.ndarray) -> np.ndarray:
     """Return delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0.
 
     >>> len(delays(np.array([0.0, 1e6, 2e6]))), float(delays(np.array([0.0, 1e6, 2e6]))[-1])
@@ -44,7 +44,9 @@ def delays(tones: np.ndarray) -> np.ndarray:
     return step * np.arange(-half, half + 1)
 
 
-def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom) -> np.ndarray:
+def alignment_factors(
+    values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom
+) -> np.ndarray:
     """Return factors (n, K) that turn rows to their references best; 1 where nothing is free.
 
     The delay is the largest of the correlation over tones, between samples by a parabola.
@@ -64,10 +66,12 @@ def turning(values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedo
         return np.ones((len(values), len(tones)), np.complex128)
     if len(values) > AT_ONCE:
         parts = np.array_split(np.arange(len(values)), -(-len(values) // AT_ONCE))
-        return np.concatenate([turning(values[part], reference[part], tones, freedom) for part in parts])
+        return np.concatenate(
+            [alignment_factors(values[part], reference[part], tones, freedom) for part in parts]
+        )
     product = (values * reference.conj()).sum(1)
     slope = np.zeros(len(values))
-    tried = delays(tones) if freedom != "phase" else np.zeros(1)
+    tried = resolvable_delays(tones) if freedom != "phase" else np.zeros(1)
     if len(tried) > 2:
         steering = np.exp(2j * np.pi * tried[:, None] * (tones - tones.mean()))
         size = np.abs(product @ steering.T)

@@ -44,7 +44,7 @@ class Separable:
         return Separable(self.rows[::stride].contiguous(), self.columns[:, ::stride].contiguous())
 
 
-def separable(blocks: Iterable[Tensor], lost: float) -> Separable:
+def fit_separable(blocks: Iterable[Tensor], lost: float) -> Separable:
     """Find the basis in which each mode of images loses at most the share `lost` of their energy.
 
     >>> basis = separable([torch.ones(5, 3, 4)], lost=1e-6)  # five equal images of 3 x 4 pixels

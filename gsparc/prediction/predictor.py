@@ -19,7 +19,7 @@ from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians, Method, Prediction, answered
 from gsparc.models.per_station import PerStation, of_station
-from gsparc.physics.row_factors import words
+from gsparc.physics.row_factors import freedom_words
 from gsparc.prediction.confidence import Judging, Trusted
 from gsparc.prediction.gradients import followed
 from gsparc.prediction.jointly import Jointly
@@ -93,7 +93,7 @@ class Predictor(InDegrees, Jointly, Judging):
     def known(self) -> str:
         """What answers are known up to: rows of channels may have had factors of their own."""
         free = self.site.freedom
-        return "all" if free == "none" else f"up to {words(free)} of each row"
+        return "all" if free == "none" else f"up to {freedom_words(free)} of each row"
 
     def at(self, station: str | int) -> Predictor:
         """Return the same model asked about one station alone, by name or number.

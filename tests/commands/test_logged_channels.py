@@ -9,7 +9,7 @@ import pytest
 
 import gsparc
 from gsparc.commands.train import train
-from gsparc.physics.row_factors import turning
+from gsparc.physics.row_factors import alignment_factors
 
 pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
 
@@ -56,5 +56,5 @@ def test_fitted_from_arrays_it_answers_up_to_what_is_free(logged):
     place, csi, tones = arrays["rx_position"], arrays["csi"], arrays["frequency_hz"]
     predictor = gsparc.fit(rx=place[~tested], tx=arrays["tx_position"], csi=csi[~tested], frequency_hz=tones)
     told, true = predictor.csi(rx=place[tested])[:, 0], csi[tested]
-    told = told * turning(told[:, None], true[:, None], tones, "phase+delay")
+    told = told * alignment_factors(told[:, None], true[:, None], tones, "phase+delay")
     assert (np.abs(told - true) ** 2).sum() < 0.06 * (np.abs(true) ** 2).sum()

@@ -12,7 +12,7 @@ from gsparc.data.datasets.rfid import planar_array
 from gsparc.field.frozen import frozen_view, seen_by_array
 from gsparc.field.response import ArrayResponse, ChannelResponse
 from gsparc.ops import Pose, SphereGrid, StalePlan
-from gsparc.physics.array_response import normalised
+from gsparc.physics.array_response import normalise_spectrum
 from gsparc.simulate.shoebox import LIGHT
 
 GRID = SphereGrid.hemisphere(8, 16)
@@ -52,7 +52,7 @@ def _array_response(how="max"):
 def test_spectra_are_the_beamformers():
     site, response = _array_response()
     h = torch.randn(3, 4, dtype=torch.complex64)
-    want = normalised(spectra(site, h).flatten(1), "max").view(3, 8, 16)
+    want = normalise_spectrum(spectra(site, h).flatten(1), "max").view(3, 8, 16)
     torch.testing.assert_close(response.spectra(h), want, atol=1e-4, rtol=1e-3)
 
 

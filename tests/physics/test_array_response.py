@@ -19,7 +19,7 @@ def _vectors(rows, elements, seed=0):
 @pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
 def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
-    lags = array_response.lags(array, WAVELENGTH)
+    lags = array_response.co_array(array, WAVELENGTH)
     direct = array_response.bartlett(h, array_response.steering(array, grid, WAVELENGTH)) ** 2
     v = torch.cat([h.real, h.imag], 1)
     numbers = torch.einsum("bi,kij,bj->bk", v, lags.forms(), v)
@@ -48,7 +48,7 @@ def test_slopes_through_the_array_and_the_normalisation(how):
 
     def splat_then_array(real, imag):
         h = array_response.array_output(torch.complex(real, imag), matrix, grid)
-        return array_response.normalised(array_response.bartlett(h, matrix), how)
+        return array_response.normalise_spectrum(array_response.bartlett(h, matrix), how)
 
     parts = [v.clone().requires_grad_() for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)]
     assert torch.autograd.gradcheck(splat_then_array, parts)
@@ -63,9 +63,9 @@ def test_slope_where_the_spectrum_vanishes_is_zero_not_nan():
 
 def test_normalised_silence_is_finite():
     for how in ("max", "minmax", "power", "none"):
-        assert torch.isfinite(array_response.normalised(torch.zeros(1, 5), how)).all()
+        assert torch.isfinite(array_response.normalise_spectrum(torch.zeros(1, 5), how)).all()
     with pytest.raises(ValueError, match="median"):
-        array_response.normalised(torch.zeros(1, 5), "median")
+        array_response.normalise_spectrum(torch.zeros(1, 5), "median")
 
 
 def test_sites_without_an_array_are_named(campaign):

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from gsparc.ops import SphereGrid
-from gsparc.physics.lags import Lags
+from gsparc.physics.lags import SpectrumLags
 
 GRID, WAVELENGTH = SphereGrid.hemisphere(18, 72), 0.125
 ELEMENTS = np.stack(
@@ -19,7 +19,7 @@ def bartlett(channels):
 
 
 def test_a_plane_wave_has_the_atom_of_its_direction():
-    space = Lags(ELEMENTS, GRID, WAVELENGTH)
+    space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     direction = np.array([0.3, -0.5, 0.0])
     direction[2] = np.sqrt(1 - (direction**2).sum())
     wave = np.exp(2j * np.pi / WAVELENGTH * ELEMENTS @ direction)
@@ -32,14 +32,14 @@ def test_lags_hold_the_whole_spectrum():
     rng = np.random.default_rng(0)
     channels = rng.normal(size=(5, 12)) + 1j * rng.normal(size=(5, 12))
     power = torch.from_numpy(bartlett(channels)).float()[None]
-    space = Lags(ELEMENTS, GRID, WAVELENGTH)
+    space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     assert space.count == 35  # (2 * 4 - 1) * (2 * 3 - 1)
     again = space.spectrum(space.of(power))
     np.testing.assert_allclose(again, power, atol=1e-4 * float(power.max()))
 
 
 def test_an_image_no_array_could_measure_is_not_in_the_span():
-    space = Lags(ELEMENTS, GRID, WAVELENGTH)
+    space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     noise = torch.rand(1, 18, 72)
     assert (space.spectrum(space.of(noise)) - noise).square().sum() > 0.05 * noise.square().sum()
     with pytest.raises(RuntimeError):

@@ -3,7 +3,7 @@ import itertools
 import pytest
 import torch
 
-from gsparc.models.image_sources.reflection_orders import find_walls, orthogonal_walls, reassign
+from gsparc.models.image_sources.reflection_orders import find_orthogonal_walls, find_walls, reassign_to_walls
 from gsparc.models.image_sources.scene import Scene
 from gsparc.physics.mirror_planes import all_sequences, bisector, images, reflect
 
@@ -62,14 +62,14 @@ def test_walls_of_a_box_are_told_from_sources_spelled_badly():
     tilted = bisector(good.sources[3].expand(2, 3), good.sources[[1, 5]])
     planes = torch.cat([walls[1:], tilted])
     bad = Scene(transmitter, planes, ((), (0,), (1,), (2,), (1, 3), (1, 4), (0, 2)), torch.zeros(7), 0.0)
-    found = orthogonal_walls(bad)
+    found = find_orthogonal_walls(bad)
     assert found is not None
     told = {(int(p[:3].abs().argmax()), round(float((p[3] * p[:3].sum()).abs()), 2)) for p in found}
     assert told == {(0, 4.0), (1, 0.0), (1, 3.0), (2, 2.5)}
-    assert len(reassign(bad, found).planes) == 4
+    assert len(reassign_to_walls(bad, found).planes) == 4
 
 
 def test_without_perpendicular_planes_there_is_no_box():
     plane = torch.tensor([[1.0, 0, 0, 4]], dtype=torch.float64)
     scene = Scene(torch.zeros(3, dtype=torch.float64), plane, ((), (0,)), torch.zeros(2), 0.0)
-    assert orthogonal_walls(scene) is None
+    assert find_orthogonal_walls(scene) is None

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.physics.row_factors import delays, turning
+from gsparc.physics.row_factors import alignment_factors, resolvable_delays
 
 TONES = 312.5e3 * np.r_[-26:0, 1:27]
 
@@ -24,19 +24,19 @@ def test_what_was_put_on_rows_is_taken_off(freedom):
     if "gain" in freedom:
         put_on = put_on * gain[:, None]
     logged = true * put_on[:, None]
-    found = turning(logged, true, TONES, freedom)
+    found = alignment_factors(logged, true, TONES, freedom)
     missed = np.abs(logged * found[:, None] - true) ** 2
     assert missed.sum() < 1e-3 * (np.abs(true) ** 2).sum()
 
 
 def test_nothing_free_turns_nothing_and_silent_rows_stay():
     true = rows()
-    assert (turning(true, true, TONES, "none") == 1).all()
-    assert np.isfinite(turning(0 * true, true, TONES, "phase+delay+gain")).all()
-    assert np.isfinite(turning(true, 0 * true, TONES, "phase+delay+gain")).all()
+    assert (alignment_factors(true, true, TONES, "none") == 1).all()
+    assert np.isfinite(alignment_factors(0 * true, true, TONES, "phase+delay+gain")).all()
+    assert np.isfinite(alignment_factors(true, 0 * true, TONES, "phase+delay+gain")).all()
 
 
 def test_delays_cover_what_tones_tell_apart_and_no_more():
-    tried = delays(TONES)
+    tried = resolvable_delays(TONES)
     assert tried[0] == pytest.approx(-0.5 / 312.5e3, rel=0.02) and tried[-1] == -tried[0]
-    assert len(delays(np.zeros(1))) == 1  # one tone tells no delay
+    assert len(resolvable_delays(np.zeros(1))) == 1  # one tone tells no delay

@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
-from gsparc.physics.row_factors import turning
+from gsparc.physics.row_factors import alignment_factors
 from gsparc.prediction.channels import interpolated
 from gsparc.prediction.confidence import judged, rivals
 from gsparc.prediction.risk import Evidence
@@ -117,7 +117,7 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     heard = uplink[rows].astype(np.complex128) * site.target_scale
     # Simulated streets know the channel, but each snapshot was turned by its own phase and timing.
     clean = there.response(site.uplink_hz, rows)
-    coarse = turning(heard, clean, site.uplink_hz, "phase+delay")
+    coarse = alignment_factors(heard, clean, site.uplink_hz, "phase+delay")
     # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
     rest = (heard * coarse[:, None] * clean.conj()).sum(1)
     away = site.uplink_hz - site.uplink_hz.mean()

@@ -12,7 +12,7 @@ from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import between
-from gsparc.physics.row_factors import FREEDOMS, Freedom, delays, turning, words
+from gsparc.physics.row_factors import FREEDOMS, Freedom, alignment_factors, freedom_words, resolvable_delays
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
-        own = "" if self.freedom == "none" else f"every row has {words(self.freedom)} of its own: "
+        own = "" if self.freedom == "none" else f"every row has {freedom_words(self.freedom)} of its own: "
         return (
             f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
             f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
@@ -87,12 +87,12 @@ def coherence(data: Measurements) -> Coherence | None:
         second, _ = _correlation(values[near[:, 2]], middle)
         measured = np.sqrt(abs((first * second.conj()).mean()))
     a, b = middle, values[near[:, 1]]
-    turned = a * turning(a, b, rows.tones, "phase+delay")[:, None]
+    turned = a * alignment_factors(a, b, rows.tones, "phase+delay")[:, None]
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
     levels = 10 * np.log10(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
     freedom: Freedom = "none"
-    noise = np.sqrt(max(np.log(max(len(delays(rows.tones)), 3)), 1.0) / values[0].size)
+    noise = np.sqrt(max(np.log(max(len(resolvable_delays(rows.tones)), 3)), 1.0) / values[0].size)
     if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
         freedom = "phase+delay" if delay > phase + MORE else "phase"
         freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom

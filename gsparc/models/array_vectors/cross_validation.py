@@ -14,7 +14,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.models.array_vectors.vector_gp import align, refine_alignment
+from gsparc.models.array_vectors.vector_gp import align_along_tree, refine_alignment
 from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, SmoothRough
@@ -24,11 +24,13 @@ PIXELS = 600  # drawn from the grid: the score needs no more
 ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
-STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
+LENGTHS, NOISE = (0.25, 0.5), 0.005  # to start from: lengths [wavelengths], and the noise
+LEAST, LARGEST = (0.02, 1e-4), (5.0, 1.0)  # length and noise
+FEW = 4  # samples, of fewer than which none is predicted
 
 
 @dataclass(frozen=True)
-class Tuned:
+class ChosenKernel:
     """The chosen kernel and its held-out errors.
 
     Attributes:
@@ -44,10 +46,10 @@ class Tuned:
     left_out: LeftOut | None = None
 
 
-def tune(
+def choose_kernel(
     vectors: np.ndarray, positions: np.ndarray, images: np.ndarray, matrix: np.ndarray, wavelength: float,
     partner: np.ndarray | None, seed: int = 0,
-) -> Tuned:  # fmt: skip
+) -> ChosenKernel:  # fmt: skip
     """Choose a kernel.
 
     Args:
@@ -71,10 +73,10 @@ def tune(
         background=background[pixels] ** 2, centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
         gaps=np.array(GAPS) * wavelength, distance=cdist(positions, positions),
     )  # fmt: skip
-    aligned = align(vectors, positions, partner)
+    aligned = align_along_tree(vectors, positions, partner)
 
     def kernel_at(parameters: np.ndarray) -> Kernel:
-        length, noise = np.exp(np.clip(parameters, np.log([0.02, 1e-4]), np.log([5.0, 1.0])))
+        length, noise = np.exp(np.clip(parameters, np.log(LEAST), np.log(LARGEST)))
         return Kernel.of_one(float(length * wavelength), float(noise), term=SmoothRough)
 
     def inverse_of(kernel: Kernel) -> np.ndarray:
@@ -86,9 +88,10 @@ def tune(
         predicted = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
         return mean_log_error(samples.error(predicted))  # up to a factor, minus the PSNR
 
-    if len(positions) < 4:
-        return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
-    first = min((np.log(start) for start in STARTS), key=objective)
+    starts = [np.log([length, NOISE]) for length in LENGTHS]
+    if len(positions) < FEW:
+        return ChosenKernel(kernel_at(starts[0]), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
+    first = min(starts, key=objective)
     refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
     optimum = minimize(
         objective, first, args=(refined,), method="Nelder-Mead",
@@ -103,7 +106,7 @@ def tune(
     error = samples.error(predicted)
     seen = ~np.isnan(error)
     left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
-    return Tuned(kernel, unknown[seen], error[seen], left_out)
+    return ChosenKernel(kernel, unknown[seen], error[seen], left_out)
 
 
 @dataclass(frozen=True)

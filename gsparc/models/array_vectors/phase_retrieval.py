@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.physics.array_response import lags
+from gsparc.physics.array_response import co_array
 from gsparc.processes.factor import Factor
 from gsparc.training.time_budget import Effort
 
@@ -24,15 +24,15 @@ log = logging.getLogger(__name__)
 SEEDED = 4  # one row in this many starts at random, the others from their solved neighbours
 NEIGHBOURS = 4  # solved neighbours that a row starts from
 STARTS = (24, 48, 96, 384)  # random starts of the rows still unsolved, round by round
-SCREENING = 12  # iterations, after which only the best eighth of the starts continues
-ITERATIONS = 60
-FINAL_ITERATIONS = 12  # from every solution
+SCREENING, ITERATIONS = 12, 60  # iterations until most starts end, and of the others
+GOES_ON = 8  # one start in this many goes on after the screening, and at least half as many
+AT_ONCE = 1536  # starts of all rows that are searched together: memory
 ENOUGH = 1.0  # a residual within the lags this many quantisation errors large is consistent with zero
 SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
 
 
 @dataclass(frozen=True)
-class Recovered:
+class RecoveredVectors:
     """Array vectors of n spectra.
 
     Attributes:
@@ -55,9 +55,9 @@ class Recovered:
         return np.hypot(self.residual, self.floor) > SUSPECT * self.expected
 
 
-def recover(
+def recover_vectors(
     site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
-) -> Recovered:
+) -> RecoveredVectors:
     """Return array vectors of spectra.
 
     Args:
@@ -89,7 +89,7 @@ def recover(
             most -= starts * len(unsolved)
         if not len(unsolved):
             break
-        for rows in unsolved.split(max(1, 1536 // starts)):
+        for rows in unsolved.split(max(1, AT_ONCE // starts)):
             keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
         while len(rows := every[cost > enough]):
             solved = (cost <= enough).numpy()
@@ -97,13 +97,14 @@ def recover(
             if near is None:
                 break
             before = int(solved.sum())
-            for part, around in zip(rows.split(256), near.split(256), strict=True):
+            few = AT_ONCE // NEIGHBOURS
+            for part, around in zip(rows.split(few), near.split(few), strict=True):
                 keep(part, _search(problem, part, state[around].flatten(0, 1), enough))
             if int((cost <= enough).sum()) - before < max(1, len(rows) // 20):
                 break
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
-    for rows in every.split(512):
-        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
+    for rows in every.split(AT_ONCE):
+        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), SCREENING))
     return problem.result(state, cost)
 
 
@@ -138,17 +139,18 @@ class _Problem:
     @staticmethod
     def of(site: Site, images: np.ndarray) -> _Problem:
         array, grid, wavelength = site.array_geometry()
-        known = lags(array, wavelength)
+        known = co_array(array, wavelength)
         basis = known.basis(grid, wavelength)
         # Whitened: squares of lag coordinates are mean squares over pixels.
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
         forms = torch.einsum("ij,jkl->ikl", r, known.forms())
         projector = q / len(basis) ** 0.5
         parts = []
-        step = 1 / 255 if images.dtype == np.uint8 else 1e-4
-        for block in np.array_split(images, max(1, len(images) // 256)):
-            image = torch.from_numpy(block.reshape(len(block), -1)).double()
-            image = image / 255 if images.dtype == np.uint8 else image
+        eight_bits = images.dtype == np.uint8
+        full = np.iinfo(np.uint8).max if eight_bits else 1
+        step = 1 / full if eight_bits else 1e-4
+        for block in np.array_split(images, max(1, len(images) // AT_ONCE)):
+            image = torch.from_numpy(block.reshape(len(block), -1)).double() / full
             z2, z1 = image.square() @ projector, image @ projector
             outside = image.square().square().mean(1) - z2.square().sum(1)
             # A rounding error e of the amplitude a is 2 a e of its square.
@@ -181,12 +183,12 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor) -> Recovered:
+    def result(self, state: Tensor, cost: Tensor) -> RecoveredVectors:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
         residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
-        return Recovered(vectors, offset, residual, floor, expected)
+        return RecoveredVectors(vectors, offset, residual, floor, expected)
 
 
 def _search(
@@ -194,8 +196,8 @@ def _search(
 ) -> tuple[Tensor, Tensor]:
     """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
 
-    Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best eighth
-    continues, and rows at the quantisation floor end.
+    Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best ones
+    continue, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
     best = torch.zeros(n, problem.unknowns, dtype=torch.float64)
@@ -217,7 +219,7 @@ def _search(
         error = torch.where(better[:, None], new_error, error)
         slope = torch.where(better[:, None, None], new_slope, slope)
         cost = torch.where(better, new_cost, cost)
-        damping = torch.where(better, damping * 0.4, damping * 3).clamp(1e-9, 1e3)
+        damping = torch.where(better, damping * 0.4, damping * 3).clamp_min(1e-9)
         stuck = damping >= 1e2
         lowest = torch.full((n,), torch.inf).double().scatter_reduce(0, owner, cost, "amin")
         improved = lowest < best_cost
@@ -226,12 +228,12 @@ def _search(
         best[improved], best_cost[improved] = state[first[improved]], lowest[improved]
         done = best_cost <= enough[rows]
         going = ~done[owner] & ~stuck
-        if iteration == SCREENING and starts > 8:
+        if iteration == SCREENING and starts > GOES_ON:
             # Ranks within each row's own starts: rows are set apart by more than any cost.
             rank = torch.argsort(torch.argsort(cost + owner * (cost.max() + 1)))
             count = torch.bincount(owner, minlength=n)
             place = rank - (count.cumsum(0) - count)[owner]
-            going &= place < max(4, starts // 8)
+            going &= place < max(GOES_ON // 2, starts // GOES_ON)
         if not going.any():
             break
         if not going.all():

@@ -24,9 +24,9 @@ from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
-from gsparc.models.array_vectors.cross_validation import tune
-from gsparc.models.array_vectors.vector_cache import recovered, report
-from gsparc.models.array_vectors.vector_gp import aligned_by, aligned_to, mirror_elements
+from gsparc.models.array_vectors.cross_validation import choose_kernel
+from gsparc.models.array_vectors.vector_cache import recover_cached, write_recovery_report
+from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, mirror_elements
 from gsparc.models.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
@@ -42,7 +42,7 @@ RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
 
 
 @dataclass(frozen=True)
-class Learned:
+class VectorProcess:
     """What training spectra say about a field through their array.
 
     Attributes:
@@ -63,7 +63,7 @@ class Learned:
     training: Spent
 
 
-def through_array(task: InitTask) -> Start:
+def start_from_array_vectors(task: InitTask) -> Start:
     """Return Gaussians whose emissions through the array are the posterior of its vectors.
 
     Raises:
@@ -75,14 +75,16 @@ def through_array(task: InitTask) -> Start:
             "init=vectors solves a linear read-out: leave init=auto, or set model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
-    process = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+    process = learn_vector_process(task.data, task.rows, task.anchors, task.seed, task.run_dir)
     return Start(
-        process.prior, partial(start, process=process, receiver=task.receiver), astuple(process.training),
-        astuple(process.elapsed), process.left_out,
+        process.prior, partial(set_emissions, process=process, receiver=task.receiver),
+        astuple(process.training), astuple(process.elapsed), process.left_out,
     )  # fmt: skip
 
 
-def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Learned:
+def learn_vector_process(
+    data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path
+) -> VectorProcess:
     """Retrieve the vectors of the given rows (cached where known) and fit their process.
 
     Args:
@@ -101,30 +103,30 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
     if not len(rows):
         raise ValueError("the training set is empty")
     (array, grid, wavelength), watch = site.array_geometry(), TimeBudget()
-    recovery, training = recovered(data, rows, seed)
+    recovery, training = recover_cached(data, rows, seed)
     elapsed = watch.counted
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
-        report(recovery, data, rows, run_dir / "array_recovery.csv")
+        write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(array, grid, wavelength).numpy()
     partner, places = mirror_elements(array), data.tx[rows]
     core = covering(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
-    tuned = tune(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
+    tuned = choose_kernel(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
     kernel = tuned.kernel
     vectors = np.empty(recovery.vectors.shape, np.complex128)
-    vectors[core] = aligned_by(recovery.vectors[core], places[core], partner, kernel)
+    vectors[core] = align_by_likelihood(recovery.vectors[core], places[core], partner, kernel)
     rest = np.setdiff1d(np.arange(len(rows)), core)
     if len(rest):
         log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
         others = recovery.vectors[rest], places[rest]
-        vectors[rest] = aligned_to(*others, vectors[core], places[core], partner, kernel)
+        vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
         "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
         kernel.length, kernel.noise, len(features.places), len(rows),
     )  # fmt: skip
-    return Learned(
+    return VectorProcess(
         Prior(
             features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
         ),
@@ -138,7 +140,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
 
 
 @torch.no_grad()
-def start(model: GaussianModel, process: Learned, receiver: Pose) -> None:
+def set_emissions(model: GaussianModel, process: VectorProcess, receiver: Pose) -> None:
     """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
     response = model.response
     assert isinstance(response, ArrayResponse)

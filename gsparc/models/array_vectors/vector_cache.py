@@ -13,7 +13,7 @@ import numpy as np
 
 from gsparc.data.assemble import identity
 from gsparc.data.schema import Measurements
-from gsparc.models.array_vectors.phase_retrieval import Recovered, recover
+from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets
 from gsparc.training.time_budget import Spent, TimeBudget
 
@@ -25,11 +25,11 @@ NAMED = 8  # suspect images named in a log line
 
 @lru_cache(maxsize=1)
 def _kept(key: str) -> dict[int, tuple[Any, ...]]:
-    """By row of the data last asked for what is known of it: its parts of `Recovered`, and seconds."""
+    """By row of the data last asked for what is known of it: its parts of `RecoveredVectors`, and seconds."""
     return {}
 
 
-def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Recovered, Spent]:
+def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
     """Return array vectors of the given rows, and the seconds they took when computed.
 
     Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
@@ -40,21 +40,21 @@ def recovered(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[Reco
         rows: (n,) sorted.
         seed: of the random starts.
     """
-    known, names = _kept(f"{identity(data)} {seed}"), [one.name for one in fields(Recovered)]
+    known, names = _kept(f"{identity(data)} {seed}"), [one.name for one in fields(RecoveredVectors)]
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
-        recovery = recover(data.site, training_targets(data, part), data.tx[part], seed)
+        recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
         spent = np.tile([*vars(watch.counted).values()], (len(part), 1)) / len(part)
         parts = zip(*(getattr(recovery, name) for name in names), spent, strict=True)
         known.update(zip(part.tolist(), parts, strict=True))
     *columns, seconds = (np.stack(part) for part in zip(*(known[row] for row in rows.tolist()), strict=True))
-    return Recovered(*columns), Spent(*seconds.sum(0).tolist())
+    return RecoveredVectors(*columns), Spent(*seconds.sum(0).tolist())
 
 
-def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
+def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np.ndarray, path: Path) -> None:
     """Write the residual of each image as CSV and log the suspect ones."""
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,7 @@ NEAREST = 30  # aligned vectors that a further one is aligned to
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
-def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
+def twin_vectors(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """Return vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
 
     Args:
@@ -42,7 +42,7 @@ def mirror_elements(array: np.ndarray) -> np.ndarray | None:
     return partner if symmetric else None
 
 
-def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
+def align_along_tree(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
     """Return vectors (n, M) with twins and phases that match a neighbour's, along a tree of short steps.
 
     The tree is the minimum spanning one of the positions (n, 3) [m].
@@ -52,17 +52,17 @@ def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None
         distance = cdist(positions, positions) + 1e-9  # zero would mean no edge
         order, before = breadth_first_order(minimum_spanning_tree(distance), 0, directed=False)
         for i in order[1:]:
-            aligned[i] = matched(aligned[i], aligned[before[i]], partner)
+            aligned[i] = match_phase_and_twin(aligned[i], aligned[before[i]], partner)
     return aligned
 
 
-def matched(
+def match_phase_and_twin(
     vector: np.ndarray, expected: np.ndarray, partner: np.ndarray | None, margin: float = 1.0
 ) -> np.ndarray:
     """Return a vector (M,), or its twin if that overlaps more with the expected one, in its phase."""
     overlap = np.vdot(vector, expected)
     if partner is not None:
-        other = twin(vector, partner)
+        other = twin_vectors(vector, partner)
         if abs(of_other := np.vdot(other, expected)) > margin * abs(overlap):
             vector, overlap = other, of_other
     return vector * (overlap / abs(overlap)) if abs(overlap) > 0 else vector
@@ -86,7 +86,7 @@ def refine_alignment(
         for i in range(len(aligned)):
             old = aligned[i].copy()
             expected = old - (inverse[i] @ parts).view(np.complex128) / diagonal[i]
-            new = matched(old, expected, partner, TWIN_MARGIN)
+            new = match_phase_and_twin(old, expected, partner, TWIN_MARGIN)
             change += float(np.linalg.norm(new - old))
             aligned[i] = new
         if change < TOLERANCE * size:
@@ -94,7 +94,7 @@ def refine_alignment(
     return aligned
 
 
-def aligned_by(
+def align_by_likelihood(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
 ) -> np.ndarray:
     """Return vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
@@ -106,10 +106,10 @@ def aligned_by(
         kernel: length and noise.
     """
     inverse = Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
-    return refine_alignment(align(vectors, positions, partner), inverse, partner)
+    return refine_alignment(align_along_tree(vectors, positions, partner), inverse, partner)
 
 
-def aligned_to(
+def align_to_nearest(
     vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
     partner: np.ndarray | None, kernel: Kernel,
 ) -> np.ndarray:  # fmt: skip
@@ -127,5 +127,5 @@ def aligned_to(
     noise = torch.full(near.shape, kernel.noise, dtype=torch.float64)
     weights, _ = weights_of(kernel, torch.from_numpy(positions), around, noise)
     for i, rows in enumerate(near):
-        aligned[i] = matched(aligned[i], weights[i].numpy() @ known[rows], partner)
+        aligned[i] = match_phase_and_twin(aligned[i], weights[i].numpy() @ known[rows], partner)
     return aligned

@@ -12,7 +12,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.uplink.interface import UplinkMethod, power, rms
+from gsparc.models.uplink.interface import UplinkMethod, mean_power, root_mean_power
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -45,7 +45,7 @@ class Ridge(UplinkMethod):
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
                 miss = self.predict(batch).mean - batch.target
                 # Mean of logarithms: a few channels in deep fades would decide a mean of ratios.
-                value = float((power(miss) / power(batch.target)).log10().mean())
+                value = float((mean_power(miss) / mean_power(batch.target)).log10().mean())
                 if best is None or value < best[0]:
                     best = value, penalty, unit
         assert best is not None
@@ -60,7 +60,7 @@ class Ridge(UplinkMethod):
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""
         batch = data.batch(rows)
         assert batch.uplink is not None
-        scale = rms(batch.uplink) if unit else torch.ones(len(rows))
+        scale = root_mean_power(batch.uplink) if unit else torch.ones(len(rows))
         targets = batch.target.flatten(1)[:, None] if self.inputs == "all" else batch.target
         x = (self._inputs(batch.uplink) / scale[:, None, None]).transpose(0, 1)
         y = (targets / scale[:, None, None]).transpose(0, 1)

@@ -19,24 +19,22 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
-from gsparc.models.directional.posterior import GainKernel, SightedSources
+from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
-from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse
-from gsparc.models.image_sources.rows import gather
-from gsparc.models.image_sources.search import Found
+from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
+from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_phase_and_static_end
+from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
-# Receivers with a ray to a source; of more sources those seen by most are kept.
-MIN_SEEN, MAX_SOURCES = 2, 60
+MIN_SEEN = 2  # receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
 MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
 REFINEMENT_ROWS = 400  # rows used for position refinement
-REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # meanwhile
+REFINEMENT_KERNEL = GainKernel(CONSTANTS[1], LENGTHS_M[1], NOISES[1])  # meanwhile
 VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
-SELECTION_ROWS = 700  # rows that the kernel is chosen on
 
 
 class DirectionalGP(SourcesInFrame):
@@ -50,9 +48,9 @@ class DirectionalGP(SourcesInFrame):
     name = "directional_gp"
     posterior: SightedSources
 
-    def __init__(self, rows: int = 3000, seed: int = 0) -> None:
-        if rows < 8:
-            raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
+    def __init__(self, rows: int = SearchSettings.rows, seed: int = 0) -> None:
+        if rows < LEAST_ROWS:
+            raise ValueError(f"directional_gp: rows must be at least {LEAST_ROWS}, got {rows}")
         self.row_limit, self.seed = rows, seed
 
     # ---- the search ----
@@ -63,7 +61,7 @@ class DirectionalGP(SourcesInFrame):
             ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
         started = TimeBudget()
-        refuse(data.site, self.name)
+        require_phase_and_static_end(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
         known = np.concatenate([fold.train, fold.val])
@@ -78,13 +76,14 @@ class DirectionalGP(SourcesInFrame):
         sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
         if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
-        sources = sources[seen[:, sources].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
-        everything = gather(data, known, self.row_limit, self.seed)
+        order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
+        sources = sources[order[: SearchSettings.max_sources]]
+        everything = draw_rows(data, known, self.row_limit, self.seed)
         self.frame = Frame.of(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}
         self.posterior = SightedSources(
-            self.frame.inside(everything),
+            self.frame.normalise(everything),
             torch.tensor([at[int(row)] for row in everything.receiver]),
             UncertainPositions(points - self.frame.middle, covariance),
             VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources]),
@@ -118,11 +117,11 @@ class DirectionalGP(SourcesInFrame):
 
     def _refit(self) -> None:
         """Powers and kernel."""
-        few = self._few(SELECTION_ROWS).learned()
+        few = self._few(SearchSettings.search_rows).learned()
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:
-        """Update visibility by the channels (see `flips`); returns how many entries changed.
+        """Update visibility by the channels (see `entries_to_flip`); returns how many entries changed.
 
         Only with one row per receiver: more of them determine the gains of their own receiver.
         """
@@ -130,14 +129,14 @@ class DirectionalGP(SourcesInFrame):
         if len(rows.unique()) < len(rows):
             return 0
         rays, probability = visibility.seen.float(), visibility.left_out.float()
-        rates = RayErrorRates.first(rays)
+        rates = RayErrorRates.initial(rays)
         for turn in range(VISIBILITY_UPDATES):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
                 self._refit()
             now = self.posterior
-            one = now.gains(now.at_rows(probability)) * now.unobstructed[:, :, None]
+            one = now.gains(now.at_rows(probability)) * now.unobstructed_waves[:, :, None]
             seen, odds = visibility.seen.float(), rates.odds(rays, probability)
-            flip = flips(seen[rows], odds[rows], *now.conditioned.left_out(), one)
+            flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), one)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])

@@ -20,24 +20,29 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsparc.models.image_sources.gp_likelihood import with_noise
+from gsparc.models.directional.triangulation import SAME_SIGMAS
+from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import spherical_waves
+from gsparc.models.image_sources.search import NOISE
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart
 
+JITTER_M2 = 1e-14  # [m^2], what float64 needs to factor the covariance of a position
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
-DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per (quarter wavelength)^3 of the prior
+DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per cell of the prior, in all
+CELL = 1 / 4  # of a wavelength
 REFINED, STEPS = 6, 8  # best draws, and Gauss-Newton steps for each
 MIN_PROBABILITY = 0.8  # of one optimum, to resolve a source
-SAME_SIGMAS = 4.0  # standard deviations within which two optima are the same
 SWEEPS = 8  # over all sources
 TOLERANCE_M = 1e-3  # [m], largest move of a sweep that ends the refinement
-NOISE, MIN_NOISE = 0.1, 1e-3  # of the rows' power
+MIN_NOISE = 1e-3  # of the rows' power
 POWER_UPDATES, MAX_RATIO = 3, 8.0  # fixed-point iterations, and largest change in each
 MAX_POWER = 4.0  # of a source, times the median
+TINY = 1e-9  # of a power: one of 0 would stay 0 for ever, as every update is proportional to it
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,8 @@ class UncertainPositions:
     @cached_property
     def lower(self) -> Tensor:
         """(K, 3, 3), Cholesky factors of the covariances."""
-        return Factor.of(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64), "raise").lower
+        jitter = torch.full_like(self.points, JITTER_M2).diag_embed()
+        return Factor.of(self.covariance + jitter, "raise").lower
 
     def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return (K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
@@ -75,10 +81,8 @@ class UncertainPositions:
 
 def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
     """Return gradients (K, n, 3) float64 [rad/m] of received phases by sources' positions, up to a sign."""
-    towards = points[:, None] - places[None]
-    away = torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-3)
     hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
-    return towards / away * (2 * math.pi / LIGHT * hertz)
+    return normalize(points[:, None] - places[None], dim=-1) * (2 * math.pi / LIGHT * hertz)
 
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
@@ -115,7 +119,7 @@ class PositionRefinement:
             return self.current  # directions were exact: nothing to refine
         self.terms = torch.stack([self._covariance_of(k) for k in range(len(self.prior.points))])
         mean_power = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
-        self.power = torch.full((len(self.terms),), 1 / max(mean_power, 1e-30))
+        self.power = torch.full((len(self.terms),), 1 / max(mean_power, TINY))
         self.resolved = torch.zeros(len(self.terms), dtype=torch.bool)
         size = torch.linalg.det(self.prior.covariance)
         order = uncertain[size[uncertain].argsort()].tolist()
@@ -131,7 +135,7 @@ class PositionRefinement:
     def _covariance_of(self, k: int) -> Tensor:
         """Covariance (n, n) of the rows by source k of unit power."""
         one = self.current.only(torch.tensor([k]))
-        wave = steering(self.rows, one.points)[:, 0] * self.visible[:, k]
+        wave = spherical_waves(self.rows, one.points)[:, 0] * self.visible[:, k]
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
 
@@ -146,13 +150,13 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            given = with_noise(self.total(), self.noise, self.rows.target)
+            given = condition_with_noise(self.total(), self.noise, self.rows.target)
             explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
             due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
-            self.power = self.power * (explained / due.clamp_min(1e-12)).clamp(1 / MAX_RATIO, MAX_RATIO)
-            self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(1e-9)
+            self.power = self.power * (explained / due.clamp_min(TINY)).clamp(1 / MAX_RATIO, MAX_RATIO)
+            self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(TINY)
             residual = float(given.weights.abs().square().sum())
-            ratio = residual / max(outputs * float(given.factor.inverse.diagonal().real.sum()), 1e-12)
+            ratio = residual / (outputs * float(given.factor.inverse.diagonal().real.sum()))
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
 
     def _refine(self, k: int) -> None:
@@ -161,13 +165,13 @@ class PositionRefinement:
         if self.resolved[k]:
             places = self.current.points[k][None]
         else:
-            places = conditional.separated(self._draws(k), self.wavelength / 8)
+            places = conditional.best_separated(self._draws(k), CELL / 2 * self.wavelength)
         places, spreads = conditional.refined(places)
         log_posterior = conditional.log_posterior(places) + 0.5 * torch.linalg.slogdet(spreads)[1]
         best = int(log_posterior.argmax())
         offset = places - places[best]
         same = ((offset @ torch.linalg.inv(spreads[best])) * offset).sum(1) < SAME_SIGMAS**2
-        same |= offset.norm(dim=1) < self.wavelength / 8
+        same |= offset.norm(dim=1) < CELL / 2 * self.wavelength
         if 1 / (1 + float((log_posterior[~same] - log_posterior[best]).exp().sum())) < MIN_PROBABILITY:
             return
         points, covariance = self.current.points.clone(), self.current.covariance.clone()
@@ -178,9 +182,9 @@ class PositionRefinement:
     def _draws(self, k: int) -> Tensor:
         """Draws (m, 3) from the prior of source k, its mean first."""
         width = torch.linalg.eigvalsh(self.prior.covariance[k]).clamp_min(0).sqrt()
-        cells = float((1 + 16 * width / self.wavelength).prod())
+        cells = float((1 + SAME_SIGMAS * width / (CELL * self.wavelength)).prod())
         count = int(min(max(DRAWS_PER_CELL * cells, MIN_DRAWS), MAX_DRAWS))
-        draw = torch.randn(count, 3, generator=self.generator, dtype=torch.float64)
+        draw = torch.randn(count, len(width), generator=self.generator, dtype=width.dtype)
         draw[0] = 0
         return self.prior.points[k] + draw @ self.prior.lower[k].T
 
@@ -198,7 +202,7 @@ class ConditionalLikelihood:
 
     def __init__(self, refinement: PositionRefinement, k: int) -> None:
         rows, prior = refinement.rows, refinement.prior
-        given = with_noise(refinement.total(without=k), refinement.noise, rows.target)
+        given = condition_with_noise(refinement.total(without=k), refinement.noise, rows.target)
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         self.rows, self.alpha = rows.take(in_view), given.weights[in_view]
         self.inverse = given.factor.inverse[in_view[:, None], in_view]
@@ -207,14 +211,14 @@ class ConditionalLikelihood:
 
     def log_posterior(self, points: Tensor) -> Tensor:
         """Log posterior (m,) float64 of places (m, 3), up to a constant."""
-        waves = steering(self.rows, points)
+        waves = spherical_waves(self.rows, points)
         matched = (waves.mH @ self.alpha).abs().square().sum(1)
         scale = 1 + self.power * (waves.conj() * (self.inverse @ waves)).real.sum(0)
         offset = points - self.centre
         rays = 0.5 * ((offset @ self.precision) * offset).sum(1)
         return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
 
-    def separated(self, points: Tensor, distance: float) -> Tensor:
+    def best_separated(self, points: Tensor, distance: float) -> Tensor:
         """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
         log_posterior = self.log_posterior(points)
         best: list[Tensor] = []
@@ -231,16 +235,14 @@ class ConditionalLikelihood:
             tried = points + step_scale[:, None] * step
             log_posterior = self.log_posterior(tried)
             better = log_posterior > best
-            points, best = (
-                torch.where(better[:, None], tried, points),
-                torch.where(better, log_posterior, best),
-            )
+            points = torch.where(better[:, None], tried, points)
+            best = torch.where(better, log_posterior, best)
             step_scale = torch.where(better, 1.0, step_scale / 3)
         return points, self._step(points)[1]
 
     def _step(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
-        waves = steering(self.rows, points)  # (n, m)
+        waves = spherical_waves(self.rows, points)  # (n, m)
         whitened = self.inverse @ waves
         known = (waves.conj() * whitened).real.sum(0) + 1 / self.power
         gain = (waves.mH @ self.alpha) / known[:, None]  # (m, R)

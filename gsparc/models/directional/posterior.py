@@ -17,11 +17,11 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from gsparc.models.directional.position_refine import UncertainPositions, coherence
+from gsparc.models.directional.position_refine import TINY, UncertainPositions, coherence
 from gsparc.models.directional.visibility import VisibilityGP
-from gsparc.models.image_sources.gp_likelihood import with_noise
+from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.in_double import in_double
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.conditioned import Conditioned
@@ -100,14 +100,14 @@ class SightedSources:
         return self.visibility.seen[self.observer].float()
 
     @property
-    def unobstructed(self) -> Tensor:
+    def unobstructed_waves(self) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, seen or not."""
-        return steering(self.rows, self.positions.points)
+        return spherical_waves(self.rows, self.positions.points)
 
     @cached_property
     def waves(self) -> Tensor:
         """The same, zero where a receiver does not see a source."""
-        return self.unobstructed * self.seen
+        return self.unobstructed_waves * self.seen
 
     @cached_property
     def uncertain(self) -> Tensor:
@@ -123,7 +123,9 @@ class SightedSources:
     def conditioned(self) -> Conditioned:
         """The rows given their covariance."""
         covariance = self._cross(self.waves, self._coherence(), self.power)
-        return with_noise(covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target)
+        return condition_with_noise(
+            covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target
+        )
 
     @cached_property
     def dual_weights(self) -> Tensor:
@@ -145,12 +147,12 @@ class SightedSources:
         """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
-        power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, 1e-30)), self.kernel
+        power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, TINY)), self.kernel
         coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
         for _ in range(ROUNDS):
             covariance = self._cross(self.waves, coherent, power)
             tried = {
-                each: with_noise(covariance * shared, each.noise, self.rows.target)
+                each: condition_with_noise(covariance * shared, each.noise, self.rows.target)
                 for each, shared in correlation.items()
             }
             kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
@@ -158,8 +160,7 @@ class SightedSources:
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
             known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
-            # A power of 0 would stay 0 for ever: every update is proportional to it.
-            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(TINY)
         return replace(self, power=power, kernel=kernel)
 
     def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
@@ -200,7 +201,9 @@ class SightedSources:
     def left_out(self) -> Tensor:
         """Return the rows (n, R), each receiver and its own visibility left out."""
         at = self.at_rows(self.visibility.left_out)
-        cross = self._cross(self.unobstructed * at.probability, at.retained, self.power) * at.correlation
+        cross = (
+            self._cross(self.unobstructed_waves * at.probability, at.retained, self.power) * at.correlation
+        )
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in groups_of(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)

@@ -26,7 +26,7 @@ CANDIDATES = 1200  # intersections scored on all rays
 ROUNDS = 12  # of matching pursuit
 STEPS = 6  # Gauss-Newton steps of a new point
 EM_ITERATIONS = 12
-SAME_SIGMAS = 4.0  # standard deviations within which two points are merged
+SAME_SIGMAS = 4.0  # standard deviations within which two points are the same
 MIN_EM_ITERATIONS = 3  # until the outlier rate has reached all points
 EM_TOLERANCE = 0.02  # relative change of sigma that ends the iterations
 MIN_OUTLIERS = 0.02  # least share of outliers
@@ -53,8 +53,8 @@ class Rays:
     @staticmethod
     def of(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
         """Gather one array (paths, 3) per receiver."""
-        flat = np.concatenate([np.zeros((0, 3)), *rays])
-        flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+        flat = np.concatenate([places[:0], *rays])
+        flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), np.finfo(float).tiny)
         return Rays(places, flat, np.repeat(np.arange(len(rays)), [len(r) for r in rays]))
 
     def __len__(self) -> int:
@@ -68,7 +68,7 @@ class Rays:
         """Return squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
         ahead = points @ self.direction.T - np.einsum("nc,nc->n", self.places[self.owner], self.direction)
         away = np.linalg.norm(points[:, None] - self.places[None], axis=-1)
-        return np.maximum(2 - 2 * ahead / np.maximum(away, 1e-9)[:, self.owner], 0.0)
+        return np.maximum(2 - 2 * ahead / np.maximum(away, np.finfo(float).tiny)[:, self.owner], 0.0)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class RayClusters:
 def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
     """Return all points where rays intersect, by falling evidence."""
     rng = np.random.default_rng(seed)
-    empty = RayClusters(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, len(rays))), MAX_ERROR)
+    empty = expectation_maximisation(rays, rays.places[:0], MAX_ERROR)
     error = _initial_error(rays, rng)
     if error is None:
         return empty
@@ -118,15 +118,17 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
 def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
     """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
     while True:
-        covariance, responsibility = np.zeros((0, 3, 3)), np.zeros((0, len(rays)))
+        responsibility = np.zeros((0, len(rays)))
+        covariance = _steps(rays, points[:0], responsibility, error)[1]
         rate: np.ndarray | float = 1.0
         for turn in range(EM_ITERATIONS if len(points) else 0):
             squared_error = rays.squared_error(points)
             responsibility = _responsibility(squared_error, error, rate)
             outliers = max(len(rays) - responsibility.sum(), MIN_OUTLIERS * len(rays))
-            rate = (np.maximum(responsibility.sum(1), 1e-3) / outliers)[:, None]
+            rate = (np.maximum(responsibility.sum(1), MIN_RESPONSIBILITY) / outliers)[:, None]
             before = error
-            error = math.sqrt((responsibility * squared_error).sum() / max(2 * responsibility.sum(), 1e-9))
+            assigned = max(responsibility.sum(), MIN_RESPONSIBILITY)
+            error = math.sqrt((responsibility * squared_error).sum() / (2 * assigned))
             error = min(max(error, MIN_ERROR), MAX_ERROR)
             points, covariance = _steps(rays, points, responsibility, error)
             if turn >= MIN_EM_ITERATIONS and abs(math.log(error / before)) < EM_TOLERANCE:
@@ -172,12 +174,13 @@ def _steps(
     offset = points[k] - rays.places[rays.owner[ray]]
     away = np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), MIN_RANGE_M)
     towards, weight = offset / away, responsibility[k, ray, None] / error**2
-    across = (np.eye(3) - towards[:, :, None] * towards[:, None, :]) * (weight / away**2)[:, :, None]
+    identity = np.eye(points.shape[1])
+    across = (identity - towards[:, :, None] * towards[:, None, :]) * (weight / away**2)[:, :, None]
     wrong = np.einsum("pcd,pd->pc", across, rays.direction[ray] * away)
-    known, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    known, pull = np.zeros((len(points), *identity.shape)), np.zeros_like(points)
     np.add.at(known, k, across)
     np.add.at(pull, k, wrong)
-    covariance = np.linalg.inv(known + np.eye(3) / REACH_M**2)
+    covariance = np.linalg.inv(known + identity / REACH_M**2)
     return points + np.einsum("kcd,kd->kc", covariance, pull), covariance
 
 
@@ -210,7 +213,7 @@ def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
 
 def _refined(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarray, float]:
     """One point after `STEPS` Gauss-Newton steps, and its evidence [nats]."""
-    points, covariance = point[None], np.zeros((1, 3, 3))
+    points = point[None]
     for _ in range(STEPS):
         points, covariance = _steps(rays, points, _responsibility(rays.squared_error(points), error), error)
     return points[0], float(_evidence(_responsibility(rays.squared_error(points), error), covariance)[0])
@@ -245,7 +248,7 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
     order = np.argsort(rays.owner, kind="stable")
     owners, starts = np.unique(rays.owner[order], return_index=True)
     if len(owners) < 2:
-        return np.zeros((0, 3))
+        return rays.places[:0]
     groups = np.split(order, starts[1:])
     couples = rng.integers(len(groups), size=(pairs, 2))
     points = []
@@ -256,7 +259,7 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
-    midpoints = np.concatenate([np.zeros((0, 3)), *points])
+    midpoints = np.concatenate([rays.places[:0], *points])
     midpoints = midpoints[np.linalg.norm(midpoints - rays.places.mean(0), axis=1) < REACH_M]
     if len(midpoints) > most:
         midpoints = midpoints[rng.choice(len(midpoints), most, replace=False)]

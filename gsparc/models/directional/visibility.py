@@ -12,13 +12,14 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import apart, matern32_of_squares
 from gsparc.processes.left_out import left_out as residuals
 
-LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
+LENGTHS_M = tuple(0.05 * 2.0 ** np.arange(7))  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance
 SPURIOUS = 0.003  # initial share of the pairs without a path that have a ray
 MIN_RATE = 1e-3  # lower bound of either rate
@@ -99,7 +100,7 @@ class RayErrorRates:
     spurious: float
 
     @staticmethod
-    def first(rays: Tensor) -> RayErrorRates:
+    def initial(rays: Tensor) -> RayErrorRates:
         """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
@@ -118,7 +119,9 @@ class RayErrorRates:
         return torch.where(rays > 0, detected, undetected) + probability.log() - (1 - probability).log()
 
 
-def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
+def entries_to_flip(
+    seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor
+) -> Tensor:
     """Return (n, K) bool, at most one visibility entry to change per receiver.
 
     Args:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import BETAS, steering
+from gsparc.models.image_sources.scene import BETAS, spherical_waves
+from gsparc.physics.draws import draw_in_box
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -27,25 +28,25 @@ STEPS, STEP_M = 25, 0.02  # of the ascent
 
 
 # Positions (m, 3) of sources to those of their antennas (E, m, 3) [m].
-Spread = Callable[[Tensor], Tensor]
+ImagesOfAntennas = Callable[[Tensor], Tensor]
 
 
-def score(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
+def likelihood_gain(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
     """
-    waves, conditioned = steering(posterior.rows, candidates), posterior.conditioned
+    waves, conditioned = spherical_waves(posterior.rows, candidates), posterior.conditioned
     matched = (waves.mH @ conditioned.weights).abs().square().sum(1)
     power = (conditioned.factor.root @ waves).abs().square().sum(0)
     gained = matched / power
     return gained / conditioned.weights.shape[1], (gained / power / conditioned.weights.shape[1]).sqrt()
 
 
-def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
+def rough_likelihood_gain(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     """Return `|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
 
-    Candidates are (m, 3), or (E, m, 3) as in `score`.
+    Candidates are (m, 3), or (E, m, 3) as in `likelihood_gain`.
     """
     middle = rows.position.mean(0)
     per_metre = (rows.frequency / LIGHT).float()
@@ -75,20 +76,20 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     return torch.cat(scores)
 
 
-def search_box(
+def find_sources_in_box(
     posterior: Posterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
-    spread: Spread,
+    spread: ImagesOfAntennas,
 ) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """Return the best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
-    `spread` gives the images of the static end's antennas, as `score` takes them.
+    `spread` gives the images of the static end's antennas, as `likelihood_gain` takes them.
     """
-    share = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
-    candidates = box[0] + (box[1] - box[0]) * share
-    rough = quick_score(posterior.rows, spread(candidates), posterior.conditioned.weights)
+    low, high = box
+    candidates = draw_in_box(low, high, CANDIDATES, generator)
+    rough = rough_likelihood_gain(posterior.rows, spread(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([score(posterior, spread(part))[0] for part in candidates.split(512)])
+    exact = torch.cat([likelihood_gain(posterior, spread(part))[0] for part in candidates.split(BLOCK)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
     optimizer = torch.optim.Adam([polished], betas=BETAS)
@@ -96,15 +97,15 @@ def search_box(
         raise_if_cancelled()
         optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)
         optimizer.zero_grad()
-        (-score(posterior, spread(polished))[0].log().sum()).backward()
+        (-likelihood_gain(posterior, spread(polished))[0].log().sum()).backward()
         optimizer.step()
     polished = polished.detach()
-    scores, amplitude = score(posterior, spread(polished))
-    chosen = pick_apart(polished, scores, min_distance, limit)
+    scores, amplitude = likelihood_gain(posterior, spread(polished))
+    chosen = select_separated(polished, scores, min_distance, limit)
     return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
 
 
-def pick_apart(
+def select_separated(
     position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0,
     known: Tensor | None = None,
 ) -> list[int]:  # fmt: skip

@@ -23,14 +23,14 @@ from gsparc.models.run_factors import run_factors
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
 
-def direct_path(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
+def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
     """Return the static end (3,) [m] alone, with its share of the power of unit rows."""
     scene = Scene.direct(static, torch.zeros(1), math.log(UNEXPLAINED))
     power = (1 - UNEXPLAINED) / scene.waves(rows).abs().square().mean()
     return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 
 
-def element_factors(rows: Rows, scene: Scene) -> Tensor | None:
+def estimate_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
 
     Args:

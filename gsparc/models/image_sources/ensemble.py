@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.search import find_clutter
-from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
-from gsparc.models.image_sources.refine import learn_visibility, refine
+from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
+from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
@@ -47,7 +47,7 @@ class Member:
     number: int = 0
 
 
-def search_many(
+def run_searches(
     row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
     budget: TimeBudget, look: Look | None = None, start: Found | None = None,
 ) -> list[Member]:  # fmt: skip
@@ -80,7 +80,7 @@ def search_many(
     def unwanted(number: int) -> bool:
         """Whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
-        return stopped.is_set() or at_noise_floor(before, noise_floor)
+        return stopped.is_set() or reached_noise_floor(before, noise_floor)
 
     def solve(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
@@ -88,19 +88,19 @@ def search_many(
 
         def last_round() -> bool:
             if look is not None and number == 0:
-                look(rows, with_phases(rows, search.scene, QUADRATURE, noise_floor))
+                look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
         search = Search(rows, transmitter, settings, number, last_round, start)
-        scene = with_phases(rows, search.run(), QUADRATURE, noise_floor)
-        scene = refine(rows, learn_visibility(rows, scene, 10, KernelVisibility()), 20)
+        scene = estimate_phases(rows, search.run(), QUADRATURE, noise_floor)
+        scene = refine_scene(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
         if look is not None and number == 0:
             look(rows, scene)
-        error = left_out_error(rows, scene)
-        hidden = scene.quadrature == 1 or at_noise_floor([error], noise_floor, 1)
-        if settings.clutter and not hidden and compact(rows):
+        error = left_out_nmse(rows, scene)
+        hidden = scene.quadrature == 1 or reached_noise_floor([error], noise_floor, 1)
+        if settings.clutter and not hidden and is_compact_array(rows):
             scene = find_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
-            error = left_out_error(rows, scene)
+            error = left_out_nmse(rows, scene)
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
@@ -134,29 +134,29 @@ def search_many(
     return sorted(members, key=lambda member: member.left_out)
 
 
-def refined(rows: Rows, member: Member) -> Member:
+def refine_member(rows: Rows, member: Member) -> Member:
     """Return a search's result on rows that have changed a little."""
-    scene = refine(rows, member.scene, 20)
-    return Member(scene, left_out_error(rows, scene), member.number)
+    scene = refine_scene(rows, member.scene, POLISHING_STEPS)
+    return Member(scene, left_out_nmse(rows, scene), member.number)
 
 
-def left_out_error(rows: Rows, scene: Scene) -> float:
+def left_out_nmse(rows: Rows, scene: Scene) -> float:
     """Return the NMSE of the rows, each receiver predicted from the others."""
     error = rows.target - Posterior(rows, scene).left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
-def compact(rows: Rows) -> bool:
+def is_compact_array(rows: Rows) -> bool:
     """Whether the static end's antennas are near enough to be occluded alike."""
     return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
 
 
-def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
+def reached_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
     """Whether `least` searches have reached the noise floor."""
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
 
 
-def weights_of(members: list[Member]) -> Tensor:
+def member_weights(members: list[Member]) -> Tensor:
     """Return weights of the searches in the average, (M,) float32 of sum 1."""
-    error = torch.tensor([max(member.left_out, 1e-6) for member in members])
+    error = torch.tensor([member.left_out for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.rows import Rows, channel_places, static_array
+from gsparc.models.image_sources.rows import Rows, channel_places, moving_end, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 
@@ -51,9 +52,9 @@ class Frame:
         power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
         if not power > 0:
             raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
-        return Frame(site, antennas, rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
+        return Frame(site, antennas, rows.position.mean(0), math.sqrt(float(power)), carrier)
 
-    def inside(self, rows: Rows) -> Rows:
+    def normalise(self, rows: Rows) -> Rows:
         """Return rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
@@ -63,10 +64,11 @@ class Frame:
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        rotation = query.rx.rotation.cpu().double().reshape(-1, 3, 3)
+        rotation = query.rx.rotation.cpu().double()
+        rotation = rotation.reshape(-1, *rotation.shape[-2:])
         position = query.rx.position if self.site.moving_end == "rx" else query.tx
         # float64: phases need lengths to a fraction of a wavelength.
-        position = position.cpu().double().reshape(-1, 3).expand(len(query), 3) - self.middle
+        position = position.cpu().double().expand(len(query), -1) - self.middle
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
@@ -135,9 +137,9 @@ class SourcesInFrame(ClosedForm):
         gain, away, sources = self._paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
-        towards = sources - places[:, :3].reshape(count, -1, 3).mean(1)[:, None]
-        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-        return *each_once(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
+        ends = moving_end(places)
+        unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
+        return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
     def _fitted(self) -> Frame:
         if self.site is None or not self.size():
@@ -145,7 +147,9 @@ class SourcesInFrame(ClosedForm):
         return self.frame
 
 
-def each_once(gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float) -> tuple[Tensor, Tensor, Tensor]:
+def merge_equal_paths(
+    gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first.
 
     Args:
@@ -164,7 +168,7 @@ def each_once(gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float) -> t
     return summed, delay[..., kept], unit[:, kept]
 
 
-def refuse(site: Site, name: str) -> None:
+def require_phase_and_static_end(site: Site, name: str) -> None:
     """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
@@ -172,7 +176,7 @@ def refuse(site: Site, name: str) -> None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
 
 
-def refuse_turning(data: Measurements) -> None:
+def require_fixed_rotation(data: Measurements) -> None:
     """Raise a `ValueError` where a static receiver of several antennas turns between measurements."""
     antennas = data.target.shape[1]
     if static_array(data.site, antennas) is None:

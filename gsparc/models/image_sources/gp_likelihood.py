@@ -28,7 +28,7 @@ from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.processes.conditioned import Conditioned
 
 
-def with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
+def condition_with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
     """Return targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
     # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
@@ -56,13 +56,13 @@ class CircularGains:
         self._real.addcmul_(correlation, pair @ pair.T)
         self._imag.addcmul_(correlation, turned @ pair.T)
 
-    def given(self, noise: Tensor | float) -> Conditioned:
+    def condition(self, noise: Tensor | float) -> Conditioned:
         """Return the rows' targets given the covariance with noise of this variance."""
         # In place and for good: `Posterior.conditioned` calls it once.
         self._real.diagonal().add_(noise)
         return Conditioned.of(self.matrix, self.target)
 
-    def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+    def slope_by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
@@ -72,21 +72,21 @@ class CircularGains:
             slopes[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
         return 2 * slopes
 
-    def by_noise(self, slope: Tensor) -> Tensor:
+    def slope_by_noise(self, slope: Tensor) -> Tensor:
         """Return the derivative () by the variance of the noise."""
         return slope.diagonal().real.sum()
 
-    def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+    def slope_by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """Return derivatives (n, n) by the correlation of one source."""
         return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
 
-def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
+def stack_real_imag(waves: Tensor) -> tuple[Tensor, Tensor]:
     """Return p and q, each (2 n, ...) float32, of complex (n, ...)."""
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
-def shares(quadrature: Tensor | float) -> Tensor:
+def variance_along_and_across(quadrature: Tensor | float) -> Tensor:
     """Return the variance along and across a gain's phase, (2,)."""
     return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
@@ -105,35 +105,37 @@ class PhasedGains(CircularGains):
 
     def add(self, scaled: Tensor, correlation: Tensor) -> None:
         """Add one source, with waves s_k w_k."""
-        pair = torch.stack(stacked(scaled), 1)
-        product = (pair * shares(self.quadrature)) @ pair.T
+        pair = torch.stack(stack_real_imag(scaled), 1)
+        product = (pair * variance_along_and_across(self.quadrature)) @ pair.T
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
-    def given(self, noise: Tensor | float) -> Conditioned:
+    def condition(self, noise: Tensor | float) -> Conditioned:
         """Return the rows' targets, half of the noise in either part."""
         self.matrix.diagonal().add_(noise / 2)
-        return Conditioned.of(self.matrix, stacked(self.target)[0])
+        return Conditioned.of(self.matrix, stack_real_imag(self.target)[0])
 
-    def by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+    def slope_by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """See `CircularGains`."""
         n, slopes = len(scaled), torch.empty_like(scaled)
         blocks = slope.view(2, n, 2, n)
         for k, one in enumerate(correlation):
-            pair = torch.stack(stacked(scaled[:, k]), 1) * shares(self.quadrature)
+            pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * variance_along_and_across(self.quadrature)
             by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
             # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
             slopes[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
         return slopes
 
-    def by_noise(self, slope: Tensor) -> Tensor:
+    def slope_by_noise(self, slope: Tensor) -> Tensor:
         """See `CircularGains`."""
         # Half of the noise is in either part, and of real values d nll is half of trace(G dK).
         return slope.diagonal().sum() / 4
 
-    def by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+    def slope_by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """See `CircularGains`; differentiable in `quadrature`."""
         n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
-        along, across = ((slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stacked(scaled))
+        along, across = (
+            (slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stack_real_imag(scaled)
+        )
         # Half, as d nll of real values is half of trace(G dK) (`Conditioned.slope`).
         return ((1 - share) * along + share * across) / 2
 
@@ -157,7 +159,7 @@ class Posterior:
 
     @cached_property
     def summed(self) -> CircularGains:
-        """Covariance of all sources, without noise until it is `given`."""
+        """Covariance of all sources, without noise until it is `condition`."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
@@ -166,7 +168,7 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self.summed.given(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
+        return self.summed.condition(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
 
     @property
     def covariance(self) -> Tensor:
@@ -191,7 +193,7 @@ class Posterior:
     @property
     def dual_weights(self) -> Tensor:
         """Dual weights of u_k + j v_k (K, n, R) complex64, before the correlation over places."""
-        n, (along, across) = len(self.rows), shares(self.scene.quadrature)
+        n, (along, across) = len(self.rows), variance_along_and_across(self.scene.quadrature)
         alpha = torch.complex(*self.conditioned.weights.split(n))
         power = self.scene.log_amplitude.mul(2).exp()
         circular = (self.waves.conj() * power).T[:, :, None] * alpha
@@ -201,7 +203,7 @@ class Posterior:
     def mean_gains(self) -> Tensor:
         """Constant part of each source's gain (K, R) complex64."""
         constant = float(self.scene.visibility.constant)
-        return constant * self.dual_weights.sum(1) * self.scene.turns[:, None]
+        return constant * self.dual_weights.sum(1) * self.scene.phase_factors[:, None]
 
     def left_out(self) -> Tensor:
         """Return leave-one-receiver-out predictions (n, R) complex64.
@@ -217,7 +219,7 @@ class Posterior:
         return self.rows.target - torch.complex(error[:n], error[n:])
 
 
-def with_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
+def estimate_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
     """Return the scene with phases of mean gains under the circular process, and a noise floor."""
     posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
     # The mean gain but for its power and constant share, which are positive and do not turn it.

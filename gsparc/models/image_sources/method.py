@@ -19,20 +19,26 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import Snapshot
 from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.image_sources import ensemble
-from gsparc.models.image_sources.element_factors import direct_path, element_factors
+from gsparc.models.image_sources.element_factors import direct_path_scene, estimate_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, refuse, refuse_turning
+from gsparc.models.image_sources.frame import (
+    Frame,
+    SourcesInFrame,
+    require_fixed_rotation,
+    require_phase_and_static_end,
+)
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.query import VARIANCE_ROWS, Means
-from gsparc.models.image_sources.rows import Rows, gather, measured_places, ranges_at, static_array
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
+from gsparc.models.image_sources.refine import POLISHING_STEPS
+from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, ranges_at, static_array
+from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.pareto import Settings
 from gsparc.models.plain import made, plain
 from gsparc.models.reduced import MeanOnly
-from gsparc.physics.mirror_planes import orientations
-from gsparc.physics.row_factors import Freedom, turning
+from gsparc.physics.mirror_planes import image_rotations, normal_form
+from gsparc.physics.row_factors import Freedom, alignment_factors
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import Race
@@ -68,9 +74,10 @@ class ImageSourceGP(SourcesInFrame):
     start: Found | None = None
 
     def __init__(
-        self, searches: int = 6, search_rows: int = 700, rows: int = 3000,
-        margin: float = 8.0, max_sources: int = 60, order: int = 3, offsets: Snapshot = "none",
-        clutter: bool = True, seed: int = 0,
+        self, searches: int = SearchSettings.searches, search_rows: int = SearchSettings.search_rows,
+        rows: int = SearchSettings.rows, margin: float = SearchSettings.margin,
+        max_sources: int = SearchSettings.max_sources, order: int = SearchSettings.order,
+        offsets: Snapshot = "none", clutter: bool = True, seed: int = 0,
     ) -> None:  # fmt: skip
         self.settings = SearchSettings(
             searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
@@ -82,25 +89,27 @@ class ImageSourceGP(SourcesInFrame):
         Raises:
             ValueError: the data are not channels, or their phase means nothing.
         """
-        refuse(data.site, self.name)
-        refuse_turning(data)
+        require_phase_and_static_end(data.site, self.name)
+        require_fixed_rotation(data)
         known = np.concatenate([fold.train, fold.val])
         self._groups = context.leave_out
         effort = context.effort * (1.0 if context.leave_out else ALONE)
         budget, settings = replace(context, effort=effort).time_budget(), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
-        self.frame = Frame.of(data.site, antennas, gather(data, known, settings.rows, settings.seed))
+        self.frame = Frame.of(data.site, antennas, draw_rows(data, known, settings.rows, settings.seed))
         noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
-        # -50 dB of the rows' power: simulated channels may have no noise, and float32 needs some to factor.
-        self.noise_floor = max(1e-5, noise / self.frame.scale**2)
+        # Simulated channels may have no noise, and float32 needs some to factor.
+        self.noise_floor = max(JITTER, noise / self.frame.scale**2)
         notes: list[str] = []
         self.factors = torch.ones(antennas, dtype=torch.complex64)
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
             # Against the direct wave first, as a search needs aligned antennas; again against what it found.
             start = self._searched_rows(data, known, 0)
-            data = self._calibrated(data, start, direct_path(start, self._transmitter(), self.noise_floor))
+            data = self._calibrated(
+                data, start, direct_path_scene(start, self._transmitter(), self.noise_floor)
+            )
         if settings.offsets != "none":
             data = self._without_offsets(data, known, budget)
             notes.append(
@@ -119,7 +128,7 @@ class ImageSourceGP(SourcesInFrame):
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known)
                 # Factors change little the second time: a refinement does, no other search.
-                members = [ensemble.refined(row_sets[one.number], one) for one in members]
+                members = [ensemble.refine_member(row_sets[one.number], one) for one in members]
         rows = self._rows(data, known)
         self._become(rows, members)
         self.held = self._left_out_rows(data, known, members, len(rows))
@@ -129,19 +138,19 @@ class ImageSourceGP(SourcesInFrame):
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
         self.members = tuple(Posterior(rows, scene) for scene in scenes)
-        self.query = Means(self.members)
+        self.query = EnsembleMeans(self.members)
 
     def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights."""
         self._conditioned(rows, [member.scene for member in members])
-        self.weights = ensemble.weights_of(members)
+        self.weights = ensemble.member_weights(members)
         return self
 
     def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
-        agree = ensemble.at_noise_floor([member.left_out for member in members], self.noise_floor)
+        agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "noise floor reached" if agree else "all counted"
         ended = "ended by the time budget" if budget.limited else ended
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
@@ -158,7 +167,7 @@ class ImageSourceGP(SourcesInFrame):
 
     def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
-        factors = element_factors(rows, scene)
+        factors = estimate_element_factors(rows, scene)
         if factors is None:
             return data
         self.factors = self.factors * factors
@@ -168,9 +177,9 @@ class ImageSourceGP(SourcesInFrame):
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
         look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
-        """What `search_many` finds about the static end, best first."""
+        """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter(), self.noise_floor
-        return ensemble.search_many(row_sets, still, settings, floor, budget, look, start)
+        return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
 
     def _looked(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
@@ -185,7 +194,7 @@ class ImageSourceGP(SourcesInFrame):
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
         most = self.settings.rows if most is None else most
-        return self.frame.inside(gather(data, index, most, self.settings.seed + number))
+        return self.frame.normalise(draw_rows(data, index, most, self.settings.seed + number))
 
     def _searched_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
         """Rows of a search by its number."""
@@ -225,7 +234,7 @@ class ImageSourceGP(SourcesInFrame):
         direct = Scene.direct(self._transmitter(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
-            few = replace(self.settings, max_sources=sources, final_steps=20, clutter=False)
+            few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
             rows = self._searched_rows(aligned, known, 0)
             scene = self._search([rows], few, budget)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
@@ -238,10 +247,8 @@ class ImageSourceGP(SourcesInFrame):
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency = data.site.tones()
-        places = measured_places(data, known).clone()
-        places[..., :3] -= self.frame.middle
-        turned = orientations(scene.planes, scene.sequences)
-        away = ranges_at(places.flatten(0, 1), scene.sources, turned)
+        places, turned = measured_places(data, known), image_rotations(scene.planes, scene.sequences)
+        away = ranges_at(places.flatten(0, 1), scene.sources + self.frame.middle, turned)
         waves = wave_over_band(away, torch.from_numpy(frequency))
         # Antennas of known places share the gains; those of unknown ones each have their own.
         if gains.shape[1] == 1 or places.shape[1] > 1:
@@ -251,7 +258,7 @@ class ImageSourceGP(SourcesInFrame):
         measured = data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
         free: Freedom = "phase" if self.settings.offsets == "phase" else "phase+delay"
         target = data.target.copy()
-        target[known] *= turning(measured, predicted, frequency, free)[:, None].astype(target.dtype)
+        target[known] *= alignment_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
     def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -289,7 +296,7 @@ class ImageSourceGP(SourcesInFrame):
         twin.weights = self.weights[chosen] / self.weights[chosen].sum()
         twin.members = tuple(self.members[i] for i in chosen.tolist())
         whole = settings.get("confidence", True)
-        twin.query = Means(twin.members, VARIANCE_ROWS if whole else 0)
+        twin.query = EnsembleMeans(twin.members, VARIANCE_ROWS if whole else 0)
         return twin if whole else MeanOnly(twin)
 
     def state(self) -> dict[str, Any]:
@@ -316,11 +323,10 @@ class ImageSourceGP(SourcesInFrame):
     def objects(self) -> SiteObjects:
         """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
-        planes = scene.planes.double()
-        normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        normal, offset = normal_form(scene.planes.double())
         # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
-        moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
-        boxes = scene.clutter.boxes.double().view(-1, 2, 3) + middle
+        moved = torch.cat([normal, offset + (normal @ middle)[:, None]], 1)
+        boxes = scene.clutter.boxes.double().unflatten(1, (2, -1)) + middle
         return SiteObjects.of(moved.numpy(), boxes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:

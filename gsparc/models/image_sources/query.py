@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, shares
-from gsparc.models.image_sources.rows import ranges_at
-from gsparc.models.image_sources.scene import directions
+from gsparc.models.image_sources.gp_likelihood import Posterior, variance_along_and_across
+from gsparc.models.image_sources.rows import moving_end, ranges_at
+from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.in_double import in_double
-from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import apart
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
+MATERN32 = 3  # factor of squared distances over lengths in Matern-3/2
 VARIANCE_ROWS = 350  # that a variance is computed from: fewer overestimate it
 
 
-class Means:
+class EnsembleMeans:
     """Means of every process, and the variance of one, at new places.
 
     Args:
@@ -45,19 +47,20 @@ class Means:
         self.places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
         self.counts = [len(scene.sequences) for scene in scenes]
         self.sources = torch.cat([scene.sources for scene in scenes])
-        self.orientations = torch.cat([orientations(scene.planes, scene.sequences) for scene in scenes])
-        kernels = [scene.visibility for scene in scenes]
-        # Constant, 6 / angle^2 and 3 / length^2.
-        numbers = [(float(k.constant), 6 * float(k.angle) ** -2, 3 * float(k.length) ** -2) for k in kernels]
-        each = torch.repeat_interleave(torch.tensor(numbers), torch.tensor(self.counts), 0)
-        constant, self.by_angle, self.by_length = each[:, :, None, None].unbind(1)
-        toward = directions(self.places[:, :3], self.sources)
+        self.orientations = torch.cat([image_rotations(scene.planes, scene.sequences) for scene in scenes])
+        numbers = torch.tensor([astuple(scene.visibility) for scene in scenes], dtype=torch.float64)
+        each = torch.repeat_interleave(numbers, torch.tensor(self.counts), 0)[:, :, None, None]
+        constant, angle, length = each.unbind(1)
+        # |u - v|^2 of unit vectors is 2 - 2 u.v.
+        self.by_angle = (2 * MATERN32 / angle**2).float()
+        self.by_length, constant = (MATERN32 / length**2).float(), constant.float()
+        toward = unit_vectors(moving_end(self.places), self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
         # Not at the first query, which may be for inference alone.
         hides = any(len(scene.clutter) for scene in scenes)
         self.hiding = [(scene.unfolding, scene.obstacles) for scene in scenes] if hides else []
         dual = torch.cat([member.dual_weights for member in members])
-        dual = dual * torch.cat([scene.turns for scene in scenes])[:, None, None]
+        dual = dual * torch.cat([scene.phase_factors for scene in scenes])[:, None, None]
         weight = torch.zeros(len(dual), len(self.places), rows.target.shape[1], dtype=dual.dtype)
         real = torch.view_as_real(weight.index_add_(1, place_of, dual)).flatten(2)  # (K, n, 2 R)
         self.weights = (real * (1 - constant)).contiguous()
@@ -68,14 +71,14 @@ class Means:
         """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
         if not self.hiding:
             return None
-        places = queries[:, :3]
+        places = moving_end(queries)
         return torch.cat([hidden.visible_share(legs.paths(places)) for legs, hidden in self.hiding])
 
     def ranges(self, queries: Tensor) -> Tensor:
         """Return ranges (m, K) float64 [m] of sources, or of their images of antennas of queries (m, 6)."""
         return ranges_at(queries, self.sources, self.orientations)
 
-    def varying(self, queries: Tensor) -> Tensor:
+    def varying_correlations(self, queries: Tensor) -> Tensor:
         """Return correlations (K, m, n) of varying gains at queries (m, 3 or 6) [m] and at the places.
 
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
@@ -83,13 +86,13 @@ class Means:
         dtype = self.towards.dtype
         squared = apart(queries, self.places).square().to(dtype)
         scaled = torch.addcmul(self.by_angle, squared, self.by_length)
-        scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources, dtype), self.towards)
+        scaled = torch.baddbmm(scaled, unit_vectors(moving_end(queries), self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances
         decay = torch.exp(-root)
         return torch.addcmul(decay, root, decay)
 
     @cached_property
-    def exact(self) -> Means:
+    def exact(self) -> EnsembleMeans:
         """The same in float64."""
         return in_double(self)
 
@@ -123,8 +126,8 @@ class Means:
         return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Gains (K, m, R), see `Means.varying`, and visible shares (K, m)."""
-        varying, seen = self.varying(part), self.visible_share(part)
+        """Gains (K, m, R), see `Means.varying_correlations`, and visible shares (K, m)."""
+        varying, seen = self.varying_correlations(part), self.visible_share(part)
         real = torch.baddbmm(self.level, varying, self.weights)
         gains = torch.view_as_complex(real.unflatten(2, (-1, 2)))
         return gains if seen is None else gains * seen[:, :, None], varying, seen
@@ -145,16 +148,16 @@ class RowVariance:
             member = Posterior(member.rows.take(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
-        self.phasor, self.power = scene.turns, scene.log_amplitude.mul(2).exp()
+        self.phasor, self.power = scene.phase_factors, scene.log_amplitude.mul(2).exp()
         self.noise = math.exp(scene.log_noise)
         there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None]  # (K, 1, 2, n)
         there = there * self.power[:, None, None, None]
         self.level, self.there = there * float(kernel.constant), there * (1 - float(kernel.constant))
-        self.along, across = shares(scene.quadrature).tolist()
+        self.along, across = variance_along_and_across(scene.quadrature).tolist()
         self.across = across * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])[..., None]
 
     def __call__(self, arriving: Tensor, varying: Tensor) -> tuple[Tensor, Tensor]:
-        """Variance and prior (m,) of visible waves (m, K) before phases; see `Means.varying`."""
+        """Variance and prior (m,) of visible waves (m, K) before phases; see `Means.varying_correlations`."""
         here = torch.view_as_real(arriving * self.phasor)  # (m, K, 2)
         there = torch.addcmul(self.level, varying[:, :, None, self.place_of], self.there)  # (K, m, 2, n)
         # Real and imaginary parts of queries with those of rows, (m, 2, 2, n); those in quadrature are the

@@ -11,92 +11,95 @@ from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene, correlations, steering
-from gsparc.physics.mirror_planes import images
+from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene
 from gsparc.processes.worker import late
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
+ROUND_STEPS, POLISHING_STEPS = 12, 20  # after a change of some sources, and of all
+VISIBILITY_STEPS = 10  # of `learn_visibility`
 DECAY_AFTER, DECAY = 0.6, 0.3  # smaller steps for the last 40 %
 TRANSMITTER_STEP = 0.0004  # [m]; small, its position is measured
-PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and along it [m]
+NORMAL_STEP, OFFSET_STEP = 0.0012, 0.004  # of a plane's unit normal, and along it [m]
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-# Negative log prior [nats] of transmitter, planes (P, 4), log amplitudes (K,), log noise and phases (K,).
-Cost = Callable[[list[Tensor]], Tensor]
+Cost = Callable[[Scene], Tensor]  # negative log prior [nats] of a scene
 
 
-def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
+def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
     """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `late`.
 
     Args:
         rows: measurements.
         scene: the start; its phases move where gains have them.
         steps: at least 0.
-        cost: a negative log prior, added to the negative log likelihood.
+        cost: of planes, log amplitudes and phases, added to the negative log likelihood.
     """
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
-    values += [] if scene.phase is None else [scene.phase]
-    rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
-    rates += [torch.tensor(STEP)] * (len(values) - 2)
-    first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
-    best, lowest, correlation = values, math.inf, torch.empty(0)
+    values = [scene.transmitter, *scene.planes.split((3, 1), 1)]
+    values += [scene.log_amplitude, torch.tensor(scene.log_noise)]
+    values = [v.clone() for v in (*values, *([] if scene.phase is None else [scene.phase]))]
+    rates = [TRANSMITTER_STEP, NORMAL_STEP, OFFSET_STEP, STEP, STEP, STEP]
+    groups = [{"params": [v], "lr": rate} for v, rate in zip(values, rates, strict=False)]
+    optimizer = torch.optim.Adam(groups, betas=BETAS, eps=1e-9)
+    best, lowest, correlation = scene, math.inf, torch.empty(0)
     for step in range(steps + 1):
+        if step == math.ceil(DECAY_AFTER * steps):
+            for group in optimizer.param_groups:
+                group["lr"] *= DECAY
         if step % REFRESH == 0:
-            correlation = correlations(rows, images(values[0], values[1], scene.sequences), scene.visibility)
-        value, gradient = _likelihood(rows, scene, values, correlation)
-        if cost is not None:
-            leaves = [v.detach().requires_grad_() for v in values]
-            with torch.enable_grad():
-                more = cost(leaves)
-                slopes = torch.autograd.grad(more, leaves, materialize_grads=True)
-            value, gradient = value + more.item(), [g + s for g, s in zip(gradient, slopes, strict=True)]
+            seen = (
+                scene.visibility.correlation(rows.places, one) for one in _scene_at(scene, values).sources
+            )
+            correlation = torch.stack([*seen])
+        value, gradient = _objective(rows, scene, values, correlation, cost)
         if value < lowest:
-            lowest, best = value, values
+            lowest, best = value, _scene_at(scene, [v.clone() for v in values])
         if step == steps or late():
             break
-        decay = 1.0 if step < DECAY_AFTER * steps else DECAY
-        moved = []
-        for i, g in enumerate(gradient):
-            first[i] = BETAS[0] * first[i] + (1 - BETAS[0]) * g
-            second[i] = BETAS[1] * second[i] + (1 - BETAS[1]) * g * g
-            mean = first[i] / (1 - BETAS[0] ** (step + 1))
-            size = (second[i] / (1 - BETAS[1] ** (step + 1))).sqrt() + 1e-9
-            moved.append(values[i] - decay * rates[i] * mean / size)
-        values = moved
-    transmitter, planes, log_amplitude, log_noise, *phase = best
+        for v, slope in zip(values, gradient, strict=True):
+            v.grad = slope
+        optimizer.step()
+    return best
+
+
+def _scene_at(scene: Scene, values: list[Tensor]) -> Scene:
+    """The scene of other transmitter, normals, offsets, log amplitudes, log noise and phases, if any."""
+    transmitter, normal, offset, log_amplitude, log_noise, *phase = values
     return replace(
-        scene, transmitter=transmitter, planes=planes, log_amplitude=log_amplitude,
-        log_noise=float(log_noise), phase=phase[0] if phase else None,
+        scene, transmitter=transmitter, planes=torch.cat([normal, offset], 1), log_amplitude=log_amplitude,
+        log_noise=log_noise.item(), phase=phase[0] if phase else None,
     )  # fmt: skip
 
 
-def _likelihood(
-    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor
+def _objective(
+    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
 ) -> tuple[float, list[Tensor]]:
-    """Negative log likelihood and its derivatives by the values: `d nll = trace(G dK)`."""
-    transmitter, planes, *phases = (v.detach().requires_grad_() for v in (*values[:2], *values[4:]))
-    waves = steering(rows, images(rows.static_ends(transmitter), planes, scene.sequences))
-    for phase in phases:
-        waves = waves * torch.polar(torch.ones(()), phase)
-    waves = waves * scene.visible_share(rows.position)
-    scaled, noise = waves.detach() * values[2].exp(), values[3].exp()
-    gains = Posterior(rows, scene).gains()
+    """Negative log likelihood and prior, and derivatives by the values: `d nll = trace(G dK)`."""
+    leaves = [v.detach().requires_grad_() for v in values]
+    moved = _scene_at(scene, leaves)
+    waves = moved.unobstructed_waves(rows) * scene.visible_share(rows.position)
+    amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
+    scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
         gains.add(scaled[:, k], one)
-    conditioned = gains.given(noise + scene.noise_floor)
-    by_waves = gains.by_waves(conditioned.slope, scaled, correlation)
+    conditioned = gains.condition(noise + scene.noise_floor)
+    by_waves = gains.slope_by_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
-    leaves = [transmitter, planes, *phases]
-    by_place, by_plane, *by_phase = torch.autograd.grad(
-        waves, leaves, by_waves * values[2].exp(), materialize_grads=True
-    )
-    by_noise = noise * gains.by_noise(conditioned.slope)
-    return conditioned.nll, [by_place, by_plane, by_amplitude, by_noise, *by_phase]
+    slopes = torch.autograd.grad(waves, leaves, by_waves * amplitude, materialize_grads=True)
+    by_place, by_normal, by_offset, _, _, *by_phase = slopes
+    by_noise = noise * gains.slope_by_noise(conditioned.slope)
+    gradient = [by_place, by_normal, by_offset, by_amplitude, by_noise, *by_phase]
+    if cost is None:
+        return conditioned.nll, gradient
+    more = cost(moved)
+    by_cost = torch.autograd.grad(more, leaves, materialize_grads=True)
+    return conditioned.nll + more.item(), [g + s for g, s in zip(gradient, by_cost, strict=True)]
 
 
-def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
+def learn_visibility(
+    rows: Rows, scene: Scene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
+) -> Scene:
     """Fit the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
@@ -105,8 +108,8 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
     Args:
         rows: a few hundred are enough.
         scene: the start.
-        steps: of Adam.
         centre: of the prior.
+        steps: of Adam.
     """
     shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
     about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
@@ -117,7 +120,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
         trial = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
         if scene.quadrature == 1:
             return trial
-        return replace(trial, quadrature=float(torch.sigmoid(value.detach()[3])))
+        return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))
 
     for _ in range(steps):
         if late():
@@ -125,12 +128,12 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
         posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
-            gains.quadrature = torch.sigmoid(value[3])
+            gains.quadrature = torch.sigmoid(value[-1])
         scaled = posterior.waves * scene.log_amplitude.exp()
         loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):
             correlation = KernelVisibility.of(value).correlation(rows.places, source)
-            loss = loss + (gains.by_correlation(slope, scaled[:, k]) * correlation).sum()
+            loss = loss + (gains.slope_by_correlation(slope, scaled[:, k]) * correlation).sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

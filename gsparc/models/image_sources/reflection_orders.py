@@ -13,18 +13,19 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
-from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, normal_form, reflect
 from gsparc.processes.worker import late
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
-DROP_STEPS, ALLOWANCE = 12, 10.0  # of refinement without a plane, and nats that may be lost
-WALL_TOLERANCE = 0.03  # of a source's distance from the transmitter, to its image in a wall
+ALLOWANCE = 10.0  # nats that may be lost with a plane
+ORDER = 3  # largest number of reflections of a source
+WALL_TOLERANCE, LEAST_M = 0.03, 0.02  # of a source's distance from the transmitter, plus [m], to an image
 NEAR_SEQUENCE_M = 0.06  # [m], to that in perpendicular ones, plus 1 % of the distance
-MOST_WALLS, MOST_ORTHOGONAL = 10, 8
+MOST_WALLS = 10
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
@@ -34,7 +35,7 @@ def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
     while index < len(scene.planes) and not late():
         shorter = _without_plane(scene, index, tolerance)
         if shorter is not None:
-            shorter = refine(rows, shorter, DROP_STEPS)
+            shorter = refine_scene(rows, shorter, ROUND_STEPS)
             if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + ALLOWANCE:
                 scene = shorter
                 continue
@@ -46,12 +47,12 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     """The scene without one plane; None when its strongest source has no other sequence."""
     users = [i for i, sequence in enumerate(scene.sequences) if index in sequence]
     rest = {sequence for i, sequence in enumerate(scene.sequences) if i not in users}
-    order = 3 if len(scene.planes) <= MANY_PLANES else 2
+    order = ORDER if len(scene.planes) <= MANY_PLANES else 2
     indices = [i for i in range(len(scene.planes)) if i != index]
     candidates = [sequence for sequence in all_sequences(indices, order) if sequence not in rest]
     if not candidates or not users:
         return None
-    distance = _distances(scene, candidates, scene.sources[users], LENGTH_PENALTY_M)
+    distance = _distances(scene, candidates, scene.sources[users])
     nearest = distance.argmin(1).tolist()
     strength = (
         scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
@@ -68,17 +69,17 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     return replace(scene, sequences=tuple(sequences)).only(sorted(numbers))
 
 
-def _distances(scene: Scene, sequences: list[Reflections], places: Tensor, per_reflection: float) -> Tensor:
+def _distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
     """Distances (places, sequences) [m], plus a penalty on the order."""
     position = images(scene.transmitter, scene.planes, sequences)
     order = torch.tensor([len(sequence) for sequence in sequences])
-    return (position[None] - places[:, None]).norm(dim=-1) + per_reflection * order
+    return (position[None] - places[:, None]).norm(dim=-1) + LENGTH_PENALTY_M * order
 
 
 def find_walls(sources: Tensor) -> Tensor | None:
     """Return walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
     count = len(sources)
-    tolerance = WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02
+    tolerance = _wall_tolerance(sources)
     first, second = torch.triu_indices(count, count, 1)
     planes = bisector(sources[first], sources[second])
     planes = planes[(sources[first] - sources[second]).norm(dim=1) > 2 * MIN_IMAGE_SHIFT_M]
@@ -100,7 +101,12 @@ def find_walls(sources: Tensor) -> Tensor | None:
     return torch.stack(chosen) if chosen else None
 
 
-def orthogonal_walls(scene: Scene) -> Tensor | None:
+def _wall_tolerance(sources: Tensor) -> Tensor:
+    """Distances (K,) [m] from images in walls within which sources (K, 3) are these images."""
+    return WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + LEAST_M
+
+
+def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     """Return the fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
 
     Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
@@ -123,8 +129,8 @@ def orthogonal_walls(scene: Scene) -> Tensor | None:
         )
         offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
         candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
-    chosen, explained = torch.zeros(0, 4, dtype=sources.dtype), 1.0
-    for _ in range(MOST_ORTHOGONAL):
+    chosen, explained = scene.planes[:0], 1.0
+    for _ in range(MOST_WALLS):
         tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
         gains = [_explained(scene, planes, allowed) for planes in tried]
         if not gains or max(gains) < explained + 0.8:
@@ -137,7 +143,7 @@ def orthogonal_walls(scene: Scene) -> Tensor | None:
 def _triad(scene: Scene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
-    normals = scene.planes[:, :3] / scene.planes[:, :3].norm(dim=1, keepdim=True)
+    normals, _ = normal_form(scene.planes)
     pairs = [(i, j) for i in range(len(used)) for j in range(i) if (normals[i] @ normals[j]).abs() < 0.02]
     if not pairs:
         return None
@@ -158,17 +164,17 @@ def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
     return float(worth.amax(1).sum())
 
 
-def reassign(scene: Scene, walls: Tensor) -> Scene:
+def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     """Return new sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
-    tolerance = 2.5 * (WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + 0.02)
+    tolerance = 2.5 * _wall_tolerance(sources)
     base = replace(scene, planes=walls)
-    candidates = all_sequences(list(range(len(walls))), 3)
-    distance = _distances(base, candidates, sources, 1.5 * LENGTH_PENALTY_M)
+    candidates = all_sequences(list(range(len(walls))), ORDER)
+    distance = _distances(base, candidates, sources)
     planes, ids, assigned = [*walls], [0], set()
     sequences: list[Reflections] = [()]
     for i in range(1, len(sources)):
-        near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
+        near = [j for j in distance[i].argsort().tolist() if distance[i, j] < tolerance[i]]
         free = next((candidates[j] for j in near if candidates[j] not in assigned), None)
         if free is not None:
             assigned.add(free)
@@ -184,7 +190,7 @@ def reassign(scene: Scene, walls: Tensor) -> Scene:
     return explained.only(list(range(len(ids))))
 
 
-def prune(rows: Rows, scene: Scene, least: float) -> Scene:
+def prune_sources(rows: Rows, scene: Scene, least: float) -> Scene:
     """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior, kept = Posterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):

@@ -7,6 +7,7 @@ the static end is the same for every receiver and folds into the complex gain. T
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +15,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.physics.waves import ranges
+
+A = TypeVar("A", Tensor, np.ndarray)
+
+
+LEAST_ROWS = 8  # that a search may be limited to
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,11 @@ class Rows:
         return static if self.array is None else static + self.array
 
 
+def moving_end(places: A) -> A:
+    """Return positions (..., 3) [m] of the moving end, of places (..., 3 or 6) as `Rows.places` has them."""
+    return places[..., :3]
+
+
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
     """Return antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
 
@@ -64,11 +75,11 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
     """
     if site.static_end != "rx" or site.array is None or antennas == 1:
         return None
-    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-    return np.asarray(site.array, np.float64) @ np.asarray(rotation, np.float64).T
+    array = np.asarray(site.array, np.float64)
+    return array if site.rx_rotation is None else array @ np.asarray(site.rx_rotation, np.float64).T
 
 
-def elements(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
+def antenna_positions(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
     """Return places (S, E, 3) [m] of antennas at positions (S, 3); E = 1 where the geometry is unknown.
 
     Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
@@ -92,10 +103,14 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
         moving = position[:, None].expand(-1, len(array), -1)
         return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
     # Antennas of a static receiver without a known array are outputs at the transmitter's place.
-    return position[:, None] if site.static_end == "rx" else elements(site, position, rotation, antennas)
+    return (
+        position[:, None]
+        if site.static_end == "rx"
+        else antenna_positions(site, position, rotation, antennas)
+    )
 
 
-def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
+def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """Return at most `limit` rows from the given measurements.
 
     Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
@@ -130,8 +145,8 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
             if count == 0:
                 continue
             comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
-            # Of six numbers the last three are the static end's antenna, which `element` names.
-            at, target = np.repeat(place[e, None, :3], count, 0), values[e, comb][:, None]
+            # `element` names the static end's antenna.
+            at, target = np.repeat(moving_end(place[e, None]), count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T
             parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
     *columns, element = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True))
@@ -153,13 +168,14 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
         sources: (K, 3) float64 [m].
         turned: (K, 3, 3), see `mirror_planes.orientations`.
     """
-    if places.shape[1] > 3:
+    position = moving_end(places)
+    if places.shape[1] > position.shape[1]:
         # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
-        sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
-    return ranges(places[:, :3], sources)
+        sources = sources + torch.einsum("kij,mj->mki", turned, places[:, position.shape[1] :])
+    return ranges(position, sources)
 
 
-def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
+def bounding_box(rows: Rows, transmitter: Tensor) -> Tensor:
     """Return the lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
     places = torch.cat([rows.position, transmitter[None]])
     return torch.stack([places.amin(0), places.amax(0)])

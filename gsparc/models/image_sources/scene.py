@@ -10,11 +10,12 @@ from typing import final
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows
-from gsparc.physics.mirror_planes import Reflections, all_sequences, images
+from gsparc.models.image_sources.rows import Rows, moving_end
+from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
 
@@ -44,7 +45,7 @@ class KernelVisibility:
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared(directions(places[:, :3], source)) / self.angle**2
+        squared = _squared(unit_vectors(moving_end(places), source)) / self.angle**2
         if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
         squared = squared + _squared(places).float() / self.length**2
@@ -100,7 +101,7 @@ class Scene:
     @staticmethod
     def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
         """Return the static end (3,) [m] alone, of log amplitude (1,)."""
-        return Scene(transmitter, torch.zeros(0, 4, dtype=torch.float64), ((),), log_amplitude, log_noise)
+        return Scene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
 
     @cached_property
     def sources(self) -> Tensor:
@@ -123,7 +124,7 @@ class Scene:
         return [i for i in range(len(self.planes)) if (i,) in self.sequences]
 
     @property
-    def turns(self) -> Tensor:
+    def phase_factors(self) -> Tensor:
         """(K,) complex64 of size 1, the phases."""
         assert self.phase is not None
         return torch.polar(torch.ones(()), self.phase)
@@ -138,24 +139,24 @@ class Scene:
         """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
-    def unobstructed(self, rows: Rows) -> Tensor:
+    def unobstructed_waves(self, rows: Rows) -> Tensor:
         """Return waves (n, K) complex64 of sources at every row, turned by phases, without clutter."""
-        waves = steering(rows, self.images(rows))
-        return waves if self.phase is None else waves * self.turns
+        waves = spherical_waves(rows, self.images(rows))
+        return waves if self.phase is None else waves * self.phase_factors
 
     def waves(self, rows: Rows) -> Tensor:
         """Return the same, attenuated by clutter."""
-        waves = steering(rows, self.images(rows)) * self.visible_share(rows.position)
-        return waves if self.phase is None else waves * self.turns
+        waves = spherical_waves(rows, self.images(rows)) * self.visible_share(rows.position)
+        return waves if self.phase is None else waves * self.phase_factors
 
-    def longer(self, order: int) -> list[Reflections]:
+    def longer_sequences(self, order: int) -> list[Reflections]:
         """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
         indices = range(len(self.planes))
         more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
         known = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
-    def over(self, sequences: Iterable[Reflections]) -> Scene:
+    def with_other_sequences(self, sequences: Iterable[Reflections]) -> Scene:
         """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
@@ -180,12 +181,12 @@ class Scene:
             planes=self.planes[used],
             sequences=tuple(tuple(new[index] for index in sequence) for sequence in sequences),
             log_amplitude=self.log_amplitude[indices],
-            clutter=self.clutter.renamed(new),
+            clutter=self.clutter.with_planes_renumbered(new),
             phase=None if self.phase is None else self.phase[indices],
         )
 
 
-def steering(rows: Rows, sources: Tensor) -> Tensor:
+def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
     """Return the spherical waves (n, K) complex64 of sources at every row.
 
     Args:
@@ -196,7 +197,7 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
         ValueError: the images of the antennas are missing.
     """
     if rows.element is not None:
-        if sources.dim() != 3:
+        if sources.dim() == 2:
             raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
         sources = sources.index_select(0, rows.element)  # (n, K, 3)
     return wave(ranges(rows.position, sources), rows.frequency[:, None])
@@ -204,19 +205,13 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
     """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
-    waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
+    waves = spherical_waves(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
 
 
-def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
-    """Return visibility correlations (K, n, n) float32."""
-    return torch.stack([kernel.correlation(rows.places, source) for source in sources])
-
-
-def directions(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+def unit_vectors(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return unit vectors (..., n, 3) from sources (..., 3) to places (n, 3) float64 [m]."""
-    offset = places - sources[..., None, :]
-    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).to(dtype)
+    return normalize(places - sources[..., None, :], dim=-1).to(dtype)
 
 
 def _is_wide(places: Tensor, length: float) -> bool:

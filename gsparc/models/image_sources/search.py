@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from typing import get_args
 
 import torch
@@ -15,10 +16,16 @@ from torch import Tensor
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
 from gsparc.field.initial import Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
-from gsparc.models.image_sources.backprojection import pick_apart, score, search_box
+from gsparc.models.image_sources.backprojection import find_sources_in_box, likelihood_gain, select_separated
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.refine import learn_visibility, refine
-from gsparc.models.image_sources.rows import Rows, box_of
+from gsparc.models.image_sources.refine import (
+    POLISHING_STEPS,
+    ROUND_STEPS,
+    VISIBILITY_STEPS,
+    learn_visibility,
+    refine_scene,
+)
+from gsparc.models.image_sources.rows import LEAST_ROWS, Rows, bounding_box
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
@@ -30,10 +37,10 @@ NOISE = 0.1  # variance at the start, of unit signal power
 PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
-STEPS = 12  # of refinement after each round
 PRUNE = 5.0  # least gain of a source kept [nats]
 Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
-PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
+PATIENCE, PROGRESS = 3, SEQUENCE_SCORE  # rounds without a gain of a source's nats, that end the search
+REARRANGED_EVERY = 3  # rounds between attempts at walls, and at the visibility's lengths
 LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
 
@@ -55,11 +62,11 @@ class SearchSettings(Checked):
     """
 
     searches: int = setting(6, whole(1))
-    search_rows: int = setting(700, whole(8))
-    rows: int = setting(3000, whole(8))
+    search_rows: int = setting(700, whole(LEAST_ROWS))
+    rows: int = setting(3000, whole(LEAST_ROWS))
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
-    order: int = setting(3, whole(0))
+    order: int = setting(orders.ORDER, whole(0))
     offsets: Snapshot = setting("none", choice(*get_args(Snapshot)))
     clutter: bool = setting(True, switch())
     seed: int = 0
@@ -85,7 +92,7 @@ class Search:
         self.rows, self.settings, self.last_round = rows, settings, last_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
-        self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
+        self.box = bounding_box(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:
@@ -98,23 +105,23 @@ class Search:
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
-        self._refine(STEPS)
+        self._refine(ROUND_STEPS)
         self._find_walls()  # among sources that it starts from
-        for number in range(60):
+        for number in count():
             added = self._add_sequences()
             free = not added
             if free:
                 added = self._add_free()
             if not added or self.last_round():
                 break
-            self._refine(STEPS)
+            self._refine(ROUND_STEPS)
             if free or number % 2:
                 self.scene = orders.drop_planes(self.rows, self.scene, 2 * self.wavelength)
-            if number >= 4 and number % 3 == 1:
+            if number > 1 and number % REARRANGED_EVERY == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = orders.prune(self.rows, self.scene, PRUNE)
-            if number % 3 == 2:
+                self.scene = orders.prune_sources(self.rows, self.scene, PRUNE)
+            if number % REARRANGED_EVERY == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
             log.debug(
@@ -129,34 +136,34 @@ class Search:
         return self._finish()
 
     def _finish(self) -> Scene:
-        self._refine(20)
+        self._refine(POLISHING_STEPS)
         self._find_walls()
-        self._reassign(orders.orthogonal_walls(self.scene))
+        self._reassign(orders.find_orthogonal_walls(self.scene))
         self.scene = orders.drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
-        self._refine(STEPS)
-        self.scene = orders.prune(self.rows, self.scene, PRUNE)
-        self._learn_visibility(10)
+        self._refine(ROUND_STEPS)
+        self.scene = orders.prune_sources(self.rows, self.scene, PRUNE)
+        self._learn_visibility(VISIBILITY_STEPS)
         self._refine(self.settings.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
-        self.scene = refine(self.rows, self.scene, steps)
+        self.scene = refine_scene(self.rows, self.scene, steps)
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, KernelVisibility())
+            self.scene = learn_visibility(few, self.scene, KernelVisibility(), steps)
 
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
         scene, most = self.scene, most or SEQUENCES_PER_ROUND
-        more = scene.over(scene.longer(self.settings.order))
+        more = scene.with_other_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
-        scores, amplitude = score(Posterior(self.rows, scene), more.images(self.rows))
+        scores, amplitude = likelihood_gain(Posterior(self.rows, scene), more.images(self.rows))
         apart = 0.5 * self.wavelength
-        chosen = pick_apart(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
+        chosen = select_separated(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
         if chosen:
             self.scene = scene.with_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
@@ -173,7 +180,7 @@ class Search:
                 break
             spread = partial(self._spread, parent)
             apart = 0.5 * self.wavelength
-            found = search_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
+            found = find_sources_in_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
             found = [source for source in found if source[1] >= FREE_SCORE]
             for position, _, amplitude in found:
                 sequence, plane = self._parent(position, posterior)
@@ -199,7 +206,7 @@ class Search:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = self.scene.over((parent,))
+        scene = self.scene.with_other_sequences((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
@@ -211,7 +218,7 @@ class Search:
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
-        scores = score(posterior, candidates)[0].reshape(mirrored.shape[:2])
+        scores = likelihood_gain(posterior, candidates)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas
@@ -230,11 +237,11 @@ class Search:
         if walls is None or late():
             return
         before = self.scene
-        self.scene = orders.reassign(before, walls)
-        self._refine(20)
+        self.scene = orders.reassign_to_walls(before, walls)
+        self._refine(POLISHING_STEPS)
         for _ in range(2):
             if self._add_sequences(6):
-                self._refine(STEPS)
+                self._refine(ROUND_STEPS)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved
         if Posterior(self.rows, self.scene).nll >= allowed:

@@ -26,7 +26,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import factors_of_runs
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
 from gsparc.models.each_or_together import LearnsTogether
-from gsparc.models.image_sources.frame import each_once
+from gsparc.models.image_sources.frame import merge_equal_paths
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
@@ -266,7 +266,7 @@ class Mixture(LearnsTogether, ClosedForm):
         gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
         delay = torch.cat([one[1] for _, one in result], dim=2)
         unit, carrier = torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
-        return *each_once(gain, delay, unit, carrier), carrier
+        return *merge_equal_paths(gain, delay, unit, carrier), carrier
 
     # -- what it is made of --------------------------------------------------------------------------
 

@@ -1,31 +1,28 @@
-"""Expected error at a place, regressed on the leave-one-out errors of training rows.
+"""Expected errors of images over the receivers' places, from the leave-one-out errors of training rows.
 
 The posterior variance of a process on images depends on the sampling density alone; errors do not: they are
-large at shadow boundaries and where paths interfere. The logarithm of the leave-one-out relative error is
-regressed on what is known of a prediction without a measurement. Far from all rows nothing is known: the
-error is that of an image drawn at random.
+large at shadow boundaries and where paths interfere. Far from all rows nothing is known: the error is that of
+an image drawn at random.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from sklearn.linear_model import RidgeCV
 from torch import Tensor
 
+from gsparc.models.relative_error import LEAST_ERROR, RelativeErrorRegression
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, matern32
 from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 16  # whose leave-one-out errors are averaged, and on which variances are conditioned
 NEAR = 4  # the distance to this neighbour is the reach of the average
-MIN_ERROR, MAX_ERROR = 1e-4, 10.0  # relative errors are clipped to
 LEAST_NOISE = 1e-6  # of neighbours that nearly coincide
-RIDGES = np.logspace(-2, 4, 13)  # chosen by leave-one-out
+LEAST_M = 1e-6  # [m], of rows that are at one place
 
 
 def image_features(image: Tensor, added: Tensor) -> Tensor:
@@ -41,18 +38,16 @@ def image_features(image: Tensor, added: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class ErrorRegression(Stored):
-    """The regression.
+class ImageErrors(Stored):
+    """Errors of images near training rows and far from them.
 
     Attributes:
         near: (n, k) rows nearest to each of the n training rows, itself first.
         precision: (n, k, k) float64, inverse of these rows' correlations with noise.
         errors: (n,) logarithms of leave-one-out relative errors.
-        centre, scale, slope: (5,) of the standardised columns: the neighbours' error, the logarithm of the
-            residual's variance given the neighbours, and `image_features`.
-        low, high: (5,) range of the columns, beyond which nothing is extrapolated.
+        regression: on five columns: the neighbours' error, the logarithm of the residual's variance given the
+            neighbours, and `image_features`.
         kernel: of the residual.
-        level: mean of the logarithm, corrected so that the mean error is unbiased.
         farthest: largest distance of a learned place to its nearest other [m].
         reach: correlation length of the sources' powers [m].
         prior: mean square error per pixel of an image drawn at random.
@@ -61,13 +56,8 @@ class ErrorRegression(Stored):
     near: Tensor
     precision: Tensor
     errors: Tensor
-    centre: Tensor
-    scale: Tensor
-    slope: Tensor
-    low: Tensor
-    high: Tensor
+    regression: RelativeErrorRegression
     kernel: Kernel
-    level: float
     farthest: float
     reach: float
     prior: float
@@ -97,35 +87,26 @@ class ErrorRegression(Stored):
         near = self.near[row]
         distance = far.gather(1, near)
         columns = _columns(self.kernel, distance, self.precision[row], self.errors[near], features)
-        columns = columns.clamp(self.low, self.high)
-        predicted = self.level + ((columns - self.centre) / self.scale) @ self.slope
         beyond = (nearest / self.farthest).clamp_min(1.0).square()
-        return predicted.clamp(math.log(MIN_ERROR), math.log(MAX_ERROR)).exp() * beyond, nearest
+        return self.regression.expected(columns) * beyond, nearest
 
 
 def fit_errors(
     places: np.ndarray, relative_error: Tensor, features: Tensor, kernel: Kernel, reach: float, prior: float
-) -> ErrorRegression:
+) -> ImageErrors:
     """Fit leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
 
-    `kernel`, `reach` and `prior` are `ErrorRegression`'s.
+    `kernel`, `reach` and `prior` are `ImageErrors`'s.
     """
-    errors = relative_error.clamp(MIN_ERROR, MAX_ERROR).log()
+    errors = relative_error.clamp_min(LEAST_ERROR).log()
     looked_at = np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1)
     distance, rows = map(torch.from_numpy, cKDTree(places).query(places, k=looked_at))
     distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
     near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
-    centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(1e-3)
-    standard = ((columns - centre) / scale).double().numpy()
-    model = RidgeCV(RIDGES).fit(standard, errors.double().numpy())
-    residual = errors.numpy() - model.predict(standard)
-    # the mean of a relative error is not the exponential of its logarithm's mean (Duan 1983)
-    level = float(model.intercept_ + np.log(np.exp(residual).mean()))
-    return ErrorRegression(
-        near, _precision(kernel, known[near]), errors, centre, scale, torch.from_numpy(model.coef_).float(),
-        columns.amin(0), columns.amax(0), kernel, level, max(float(distance[:, 0].max()), 1e-6), reach, prior,
-    )  # fmt: skip
+    regression = RelativeErrorRegression.of(columns, relative_error)
+    precision, farthest = _precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M)
+    return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
 
 def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:
@@ -153,5 +134,5 @@ def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
 def _average(distance: Tensor, values: Tensor) -> Tensor:
     """Mean (m,) of neighbours' values (m, k) with exponential weights of the distances (m, k)."""
     near = min(NEAR, distance.shape[1])
-    reach = distance.kthvalue(near, dim=1, keepdim=True).values.clamp_min(1e-9)
+    reach = distance.kthvalue(near, dim=1, keepdim=True).values.clamp_min(LEAST_M)
     return ((-distance / reach).softmax(1) * values).sum(1)

@@ -22,19 +22,19 @@ from gsparc.models.in_double import in_double
 from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
-from gsparc.models.moving_array.query import Array, Images, reduced
+from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduced
 from gsparc.models.moving_array.residual import fit_residual, left_out_error
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
     SearchSettings,
     find_sources,
-    powers,
+    nonnegative_powers,
+    pixel_exponent,
     site_problem,
-    unexplained_energy,
 )
 from gsparc.models.target_rows import heard, to_real, training_targets
-from gsparc.physics.lags import BLOCK, Lags
-from gsparc.physics.separable import Separable, separable
+from gsparc.physics.lags import BLOCK, SpectrumLags
+from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -127,7 +127,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Before any lags are taken: they are linear in power, not in amplitude.
         self.exponent = self._exponent(targets)
-        self.basis = separable(self._blocks(targets), UNRESOLVED)
+        self.basis = fit_separable(self._blocks(targets), UNRESOLVED)
         spectra = self._spectra(positions, targets)
         sources = self._find(spectra)
         power = self._powers(spectra, sources)
@@ -156,7 +156,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        exponent, left = unexplained_energy(self.lags(), self._images(targets[_spread(len(targets), 16)]))
+        exponent, left = pixel_exponent(self.lags(), self._images(targets[_spread(len(targets), 16)]))
         if left > MAX_UNEXPLAINED:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
@@ -183,7 +183,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Powers (n, K) float64 that explain each row best."""
         array = self.array()
         return torch.cat([
-            powers(part, array.atoms(sources, places), self.search.ridge)
+            nonnegative_powers(part, array.atoms(sources, places), self.search.ridge)
             for part, places in zip(spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True)
         ]).double().numpy()  # fmt: skip
 
@@ -258,35 +258,35 @@ class MovingArrayField(Differentiable, ClosedForm):
         unknown, variance = errors.expected(answer.far, features, power)
         return Prediction(mean, variance, unknown, answer.explained.clamp(0, 1))
 
-    def query(self) -> Images:
+    def query(self) -> ImageRenderer:
         """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
-            self._query = Images(self.array(), self.basis, self.found, self.residual, places)
+            self._query = ImageRenderer(self.array(), self.basis, self.found, self.residual, places)
         return self._query
 
     def size(self) -> int:
         """Return the number of sources."""
         return len(self.found.sources) if "found" in vars(self) else 0
 
-    def array(self, stride: int = 1) -> Array:
+    def array(self, stride: int = 1) -> ReceivingArray:
         """Return the array, which looks at every `stride`-th pixel."""
-        return Array(self.lags(), self.rotation(), self.exponent, stride)
+        return ReceivingArray(self.lags(), self.rotation(), self.exponent, stride)
 
     def rotation(self) -> Tensor:
         """Return the rotation (3, 3) of the array, receiver to world."""
         assert self.site is not None and self.site.rx_rotation is not None
         return torch.from_numpy(np.asarray(self.site.rx_rotation)).float()
 
-    def lags(self) -> Lags:
+    def lags(self) -> SpectrumLags:
         """Return the array's lags, computed once."""
         assert self.site is not None
         if self._lags is None:
-            self._lags = Lags(*self.site.array_geometry())
+            self._lags = SpectrumLags(*self.site.array_geometry())
         return self._lags
 
-    _lags: Lags | None = None
-    _query: Images | None = None
+    _lags: SpectrumLags | None = None
+    _query: ImageRenderer | None = None
 
     def _images(self, targets: np.ndarray) -> Tensor:
         return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)

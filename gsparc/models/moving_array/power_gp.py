@@ -52,7 +52,7 @@ class PowerTrend(Stored):
         return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
 
 
-def solved(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
+def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
     posterior = Exact.of(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, left_out(posterior.factor.precision, posterior.weights)[0]
@@ -63,7 +63,7 @@ def fit_trend(
 ) -> tuple[PowerTrend, np.ndarray]:
     """Return the trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
-    weights, residual = solved(kernel, places, torch.from_numpy(power - level))
+    weights, residual = solve_and_leave_out(kernel, places, torch.from_numpy(power - level))
     # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more
     trend = PowerTrend(sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous())
     return trend, power - residual.numpy()

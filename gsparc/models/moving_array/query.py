@@ -18,11 +18,11 @@ from gsparc.models.in_double import in_double
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
-from gsparc.models.moving_array.triangulate import bearings, mixture
+from gsparc.models.moving_array.triangulate import bearings, mix_lags
 from gsparc.models.pareto import Settings
 from gsparc.models.reduced import Filled, View
 from gsparc.ops.transforms import followed
-from gsparc.physics.lags import Lags
+from gsparc.physics.lags import SpectrumLags
 from gsparc.physics.separable import Separable
 from gsparc.processes.kernel import apart
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from gsparc.models.moving_array.method import MovingArrayField
 
 
-class Array:
+class ReceivingArray:
     """The array that looks.
 
     Args:
@@ -40,7 +40,7 @@ class Array:
         stride: between the pixels that are rendered.
     """
 
-    def __init__(self, space: Lags, rotation: Tensor, exponent: int, stride: int = 1) -> None:
+    def __init__(self, space: SpectrumLags, rotation: Tensor, exponent: int, stride: int = 1) -> None:
         self.space, self.rotation, self.exponent = space, rotation, exponent
         self._pixels = space.pixels if stride == 1 else space.pixels.thinned(stride)
 
@@ -50,14 +50,14 @@ class Array:
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
         """Return images (n, H, W) of sources of powers (n, K)."""
-        images = self.space.spectrum(mixture(power, self.atoms(sources, receivers)), self._pixels)
+        images = self.space.spectrum(mix_lags(power, self.atoms(sources, receivers)), self._pixels)
         if self.exponent == 1 or not followed(images):
             return images if self.exponent == 1 else images.sqrt()
         bright = images > 0  # at 0 a root has no slope
         return torch.where(bright, torch.where(bright, images, 1.0).sqrt(), 0.0)
 
 
-class Found(NamedTuple):
+class ImageAnswers(NamedTuple):
     """Answers at m places.
 
     Attributes:
@@ -73,7 +73,7 @@ class Found(NamedTuple):
     far: Tensor
 
 
-class Images:
+class ImageRenderer:
     """What a fitted field answers with.
 
     Args:
@@ -85,7 +85,7 @@ class Images:
     """
 
     def __init__(
-        self, array: Array, basis: Separable, trend: PowerTrend, residual: Residual,
+        self, array: ReceivingArray, basis: Separable, trend: PowerTrend, residual: Residual,
         places: Tensor,
     ) -> None:  # fmt: skip
         self._array, self._basis, self._trend, self._residual = array, basis, trend, residual
@@ -93,17 +93,17 @@ class Images:
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
 
-    def __call__(self, where: Tensor) -> Found:
+    def __call__(self, where: Tensor) -> ImageAnswers:
         """At places (m, 3) float64 [m]."""
         receivers, centred = (at.to(self._places.dtype) for at in (where, where - self._middle))
         far = apart(centred, self._places)
         explained = self._array.render(self._trend.sources, receivers, self._trend.powers(far))
         added = self._residual.coefficients(far)
         # In place into fresh images: another copy would be as large as the answer.
-        return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
+        return ImageAnswers(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
 
     @cached_property
-    def exact(self) -> Images:
+    def exact(self) -> ImageRenderer:
         """The same in float64."""
         return in_double(self)
 
@@ -141,7 +141,7 @@ class ReducedMean(View):
         basis = inner.basis if stride == 1 else inner.basis.thinned(stride)
         residual = inner.residual.first(count)
         places = torch.from_numpy(inner.positions)
-        self._query = Images(inner.array(stride), basis, inner.found, residual, places)
+        self._query = ImageRenderer(inner.array(stride), basis, inner.found, residual, places)
         self._count = count
 
     @torch.no_grad()

@@ -14,7 +14,7 @@ from scipy.linalg import eigh
 from torch import Tensor
 
 from gsparc.models.baselines.gp import choose_kernel
-from gsparc.models.moving_array.power_gp import solved
+from gsparc.models.moving_array.power_gp import solve_and_leave_out
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored
 
@@ -58,9 +58,11 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
         none = Residual(kernel, mean, torch.zeros(0, len(mean)), torch.zeros(len(values), 0))
         return none, mean.expand(values.shape)
     centred = (values - mean).double().numpy()
-    weights, missed = (part.numpy() for part in solved(kernel, places, torch.from_numpy(centred)))
+    weights, missed = (
+        part.numpy() for part in solve_and_leave_out(kernel, places, torch.from_numpy(centred))
+    )
     predicted = centred - missed
-    energy, axes = principal(predicted, limit)
+    energy, axes = principal_axes(predicted, limit)
     left_out = (predicted**2).sum() - energy.sum() + energy[::-1].cumsum()[::-1] - energy
     basis = axes[: 1 + int((left_out > SPARED * (missed**2).sum()).sum())]
     turned = torch.from_numpy(weights @ basis.T).float().contiguous()
@@ -72,14 +74,14 @@ def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
     """Return the left-out squared error of images (n, R) under the likeliest kernel, and that kernel."""
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
-    scores = centred @ principal(centred, KERNEL_COMPONENTS)[1].T
+    scores = centred @ principal_axes(centred, KERNEL_COMPONENTS)[1].T
     kernel = choose_kernel(places, scores, values.shape[1])
-    residual = solved(kernel, places, torch.from_numpy(scores))[1]
+    residual = solve_and_leave_out(kernel, places, torch.from_numpy(scores))[1]
     missed = float(residual.square().sum()) + (centred**2).sum() - (scores**2).sum()
     return float(missed) / len(values), kernel
 
 
-def principal(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+def principal_axes(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them, falling."""
     n, r = values.shape
     gram = values @ values.T if n <= r else values.T @ values

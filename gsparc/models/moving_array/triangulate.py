@@ -9,14 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
 from gsparc.models.terms import no_array
 from gsparc.ops import SphereGrid
-from gsparc.physics.lags import Lags
+from gsparc.physics.draws import draw_in_box
+from gsparc.physics.lags import SpectrumLags
 
 SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
+BEST_PART = 8  # one in this many candidates may be a source
+COMPARED = 12  # receivers whose bearings tell two candidates apart
+SEEN_AT_ONCE = 64  # receivers of a step of refinement
 
 
 @dataclass(frozen=True)
@@ -50,12 +55,11 @@ class SearchSettings:
 
 def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:
     """Return unit vectors (n, K, 3) from receivers (n, 3) to sources (K, 3) [m], receiver frame."""
-    way = sources[None] - receivers[:, None]
-    return (way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)) @ rotation
+    return normalize(sources[None] - receivers[:, None], dim=-1) @ rotation
 
 
 @torch.no_grad()
-def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
+def nonnegative_powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     """Return the power (n, K), none negative, of each source at each receiver.
 
     Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate descent from
@@ -76,14 +80,14 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     return power
 
 
-def mixture(power: Tensor, atoms: Tensor) -> Tensor:
+def mix_lags(power: Tensor, atoms: Tensor) -> Tensor:
     """Return lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
 
 def find_sources(
-    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: Lags, grid: SphereGrid,
-    settings: SearchSettings, seed: int, over: Callable[[], bool],
+    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
+    grid: SphereGrid, settings: SearchSettings, seed: int, over: Callable[[], bool],
 ) -> Tensor:  # fmt: skip
     """Return positions (K, 3) float32 [m] of sources.
 
@@ -102,17 +106,17 @@ def find_sources(
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
     low, high = low - far, high + far
-    known = torch.empty(0, 3) if first is None else first.reshape(1, 3).float()
+    known = receivers[:0] if first is None else first[None].float()
 
     def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.atoms(bearings(sources, receivers, rotation))
-        return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
+        return lags - mix_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
     positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
-        candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
+        candidates = draw_in_box(low, high, settings.candidates, generator)
         # Amplitudes: with powers the nearest receiver would decide alone.
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
@@ -134,7 +138,7 @@ def find_sources(
         progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         # As many receivers a step on every site, so that its time is bounded.
-        some = torch.randperm(len(receivers), generator=generator)[:64]
+        some = torch.randperm(len(receivers), generator=generator)[:SEEN_AT_ONCE]
         residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))
         # A share of the energy: levels of spectra must not matter beside Adam's epsilon.
         loss = residual.square().sum() / lags[some].square().sum()
@@ -153,9 +157,9 @@ def _best(
     for image, receiver in zip(images, receivers, strict=True):
         pixel, inside = _pixels(bearings(candidates, receiver[None], rotation)[0], grid)
         score += torch.where(inside, image[pixel], 0.0)
-    # The best eighth: doubles are found by comparing pairs one by one.
-    ranked = candidates[score.argsort(descending=True)[:1500]]
-    some = receivers[:: max(1, len(receivers) // 12)][:12]
+    # Doubles are found by comparing pairs one by one.
+    ranked = candidates[score.argsort(descending=True)[: len(candidates) // BEST_PART]]
+    some = receivers[:: max(1, len(receivers) // COMPARED)][:COMPARED]
     seen = bearings(ranked, some, rotation).transpose(0, 1).reshape(len(ranked), -1)
     chosen: list[int] = []
     for i in range(len(ranked)):
@@ -182,13 +186,13 @@ def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
 MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
 
 
-def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
+def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
     """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
     residual = {}
     for exponent in (2, 1):
         power = images**exponent
         again = space.spectrum(space.of(power))
-        residual[exponent] = float((again - power).square().sum() / power.square().sum().clamp_min(1e-12))
+        residual[exponent] = float((again - power).square().sum() / power.square().sum())
     exponent = min(residual, key=lambda e: residual[e])
     return exponent, residual[exponent]
 

@@ -19,7 +19,7 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
-from gsparc.models.uplink.interface import UplinkMethod, rms
+from gsparc.models.uplink.interface import UplinkMethod, root_mean_power
 from gsparc.training.context import FitContext, FitReport
 
 
@@ -47,7 +47,7 @@ class Coder(Network):
     def heard(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
         """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
         # Both bands lose alike along the path: the uplink's level carries over to the downlink.
-        scale = rms(uplink)[:, None, None]
+        scale = root_mean_power(uplink)[:, None, None]
         return uplink[:, self.antennas] / scale, scale
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer
 from gsparc.ops import Pose
-from gsparc.physics.array_response import bartlett, normalised, steering
+from gsparc.physics.array_response import bartlett, normalise_spectrum, steering
 from gsparc.physics.waves import LIGHT
 
 MARGIN = 3.0  # [m] around the moving end's box, where radiators start
@@ -101,4 +101,4 @@ class Radiators(Network):
         if self.steering is None:
             return arriving
         image = bartlett(arriving[..., 0], self.steering)
-        return normalised(image, self.scene.site.normalisation).view(-1, *self.scene.shape)
+        return normalise_spectrum(image, self.scene.site.normalisation).view(-1, *self.scene.shape)

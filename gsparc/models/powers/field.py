@@ -22,7 +22,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import SceneWalls
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.known.images import counted
+from gsparc.models.image_sources.known.images import walls_of_file
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.own_terms import InWorld, learned
@@ -99,7 +99,7 @@ class PowerField(ClosedForm):
         for one in more:  # once: a query has no time for it, nor has `torch.func`
             one.check(torch.from_numpy(seen.places))
         if self.walls is not None:
-            walls = counted(self.walls, site.origin, site.static_position)
+            walls = walls_of_file(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
             told = int((~seen.silent).sum()) >= LAW_NEEDS
             law, notes = law_of(seen, site) if told else (None, ())

@@ -21,7 +21,7 @@ from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
 from gsparc.field.initial import InitTask, Start, unchanged
 from gsparc.field.model import GaussianModel
-from gsparc.models.array_vectors.splat_init import through_array
+from gsparc.models.array_vectors.splat_init import start_from_array_vectors
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
@@ -200,7 +200,7 @@ def prepare(task: InitTask) -> Start:
         ValueError: a start is asked for that the data do not allow.
     """
     if task.settings.response.array and task.closed_form:
-        return through_array(task)
+        return start_from_array_vectors(task)
     if task.closed_form:
         assert task.receiver is not None  # else `auto_settings` refuses
         process = learn_process(task.data, task.rows, task.anchors, task.seed)

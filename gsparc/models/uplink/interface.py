@@ -11,6 +11,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.method import Method, Prediction
+from gsparc.models.target_rows import TINY_POWER
 
 
 @runtime_checkable
@@ -26,14 +27,14 @@ class SeparatesPaths(Protocol):
         """Return channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
 
-def power(channels: Tensor) -> Tensor:
-    """Return the mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
-    return channels.abs().square().mean((1, 2)).clamp_min(1e-30)
+def mean_power(channels: Tensor) -> Tensor:
+    """Return the mean square (B,) of channels (B, antennas, tones), at least `TINY_POWER`."""
+    return channels.abs().square().mean((1, 2)).clamp_min(TINY_POWER)
 
 
-def rms(channels: Tensor) -> Tensor:
+def root_mean_power(channels: Tensor) -> Tensor:
     """Return the root of the same."""
-    return power(channels).sqrt()
+    return mean_power(channels).sqrt()
 
 
 class UplinkMethod(Method):

@@ -14,10 +14,11 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.uplink.error_model import RelativeErrorRegression, SearchResult, estimate_noise
-from gsparc.models.uplink.interface import UplinkMethod, power
+from gsparc.models.relative_error import RelativeErrorRegression
+from gsparc.models.uplink.error_model import SearchedSnapshots, estimate_noise
+from gsparc.models.uplink.interface import UplinkMethod, mean_power
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
-from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
+from gsparc.physics.plane_waves import Aperture, mean_delay, phasor, planar_places
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -96,7 +97,7 @@ class UplinkField(UplinkMethod):
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
-                error.append(power(mean - true) / power(true))
+                error.append(mean_power(mean - true) / mean_power(true))
                 features.append(result.features(mean, aperture))
         return torch.cat(features), torch.cat(error)
 
@@ -124,11 +125,11 @@ class UplinkField(UplinkMethod):
             error = self.error_model.expected(result.features(mean, aperture))
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
-            variance = error * power(mean)
+            variance = error * mean_power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
         return Prediction(mean, variance, error / (1 + error))
 
-    def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchResult:
+    def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchedSnapshots:
         aperture = self.search.aperture
         if noise is None:
             noise = estimate_noise(uplink, aperture, self.settings.delay_window)
@@ -138,7 +139,7 @@ class UplinkField(UplinkMethod):
         chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
         found, left = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
         sources = Sources(*map(torch.cat, zip(*(vars(part).values() for part in found), strict=True)))
-        return SearchResult(
+        return SearchedSnapshots(
             replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
         )
 
@@ -147,7 +148,7 @@ class UplinkField(UplinkMethod):
         assert site.subcarriers_hz is not None and site.carrier_hz is not None
         self._middle_hz = float(site.uplink_hz.mean())
         self._spacing_hz = float(np.diff(np.sort(site.uplink_hz)).min())
-        places = flat_places(site.uplink_array, LIGHT / site.carrier_hz)
+        places = planar_places(site.uplink_array, LIGHT / site.carrier_hz)
 
         def tones(frequency: np.ndarray) -> Tensor:
             return torch.from_numpy((frequency - self._middle_hz) / self._spacing_hz).float()
@@ -159,14 +160,15 @@ class UplinkField(UplinkMethod):
     # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        error_model = None if self.error_model is None else vars(self.error_model)
-        return {"search": asdict(self.search.settings), "trust": error_model}
+        error_model = None if self.error_model is None else self.error_model.state()
+        return {"search": asdict(self.search.settings), "error_model": error_model}
 
     def restore(self, site: Site, state: Mapping[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
         self._prepare(site, SearchSettings(**state["search"]))
-        self.error_model = None if state["trust"] is None else RelativeErrorRegression(**state["trust"])
+        said = state["error_model"]
+        self.error_model = None if said is None else RelativeErrorRegression.read(said)
 
     def size(self) -> int:
         """Return the number of sources of a snapshot."""

@@ -13,14 +13,19 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import internal
-from gsparc.models.uplink.interface import power
-from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
+from gsparc.models.uplink.interface import mean_power
+from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
 from gsparc.processes.factor import Factor
 
 LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
 UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
-LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction of a resolution cell
-REACH = (0.03, 0.006)  # prior standard deviation of a step: half a step of the grid
+REACH = (0.03, 0.006)  # prior standard deviation of a step of cosines, and of delays: half a step of the grid
+LARGEST = 2  # of these deviations, that a step may have
+
+
+def repeat_per_coordinate(gain: Tensor) -> Tensor:
+    """Return gains (B, N) once for each coordinate of their sources, (B, 3 N): two cosines and a delay."""
+    return gain.repeat(1, 3)
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,10 @@ class Sources:
 
     def response(self, aperture: Aperture) -> Tensor:
         """Return channels (B, A, K) complex64."""
-        over_antennas, over_tones = steering(self.direction, aperture), delays(self.delay, aperture)
+        over_antennas, over_tones = (
+            antenna_responses(self.direction, aperture),
+            tone_responses(self.delay, aperture),
+        )
         return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
 
     def error_variance(self, aperture: Aperture) -> Tensor:
@@ -65,7 +73,7 @@ class Sources:
         gram = Columns.of(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
         # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
-        gains = self.gain.repeat(1, 3)
+        gains = repeat_per_coordinate(self.gain)
         slopes = gram[:, count:, count:] * gains[:, None] * gains.conj()[..., None]
         mixed = self.gain_slopes.mH @ (gram[:, :count, count:] * gains[:, None])
         from_gains = self.gain_slopes.mH @ (gram[:, :count, :count] @ self.gain_slopes)
@@ -108,13 +116,13 @@ class SourceSearch:
     def __init__(self, aperture: Aperture, settings: SearchSettings) -> None:
         self.aperture, self.settings = aperture, settings
         self.cosines, self.delays, self.shape = _grid(aperture, settings)
-        self._over_antennas = steering(self.cosines[None], aperture)[0].conj()
-        self._over_tones = delays(self.delays[None], aperture)[0].conj().T.contiguous()
+        self._over_antennas = antenna_responses(self.cosines[None], aperture)[0].conj()
+        self._over_tones = tone_responses(self.delays[None], aperture)[0].conj().T.contiguous()
 
     def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
         """Sources of snapshots (B, A, K) complex64 of noise power (B,), and the residual (B, A, K)."""
         s = self.settings
-        heard = power(snapshot)
+        heard = mean_power(snapshot)
         scale = heard.sqrt()
         y, noise = snapshot / scale[:, None, None], noise / heard + s.leakage
         count = len(snapshot)
@@ -156,7 +164,7 @@ class SourceSearch:
         torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
         cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
         gain = (inverse @ inner[:, :n, None])[..., 0]
-        gains = gain.repeat(1, 3)
+        gains = repeat_per_coordinate(gain)
         slope = ((inner[:, n:] - (cross @ gain[..., None])[..., 0]) * gains.conj()).real
         gain_slopes = cross @ inverse
         # Variable projection: what other gains can make up for tells nothing of places.
@@ -170,8 +178,8 @@ class SourceSearch:
         reach = self._reach(n)
         factor = Factor.of(self._scaled(fit, noise), "ignore")
         step = factor.solved((fit.slope * reach)[..., None])[..., 0] * reach
-        turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
-        return turned, step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
+        step = step.clamp(-LARGEST * reach, LARGEST * reach)
+        return step[:, : 2 * n].view(-1, 2, n).transpose(1, 2), step[:, 2 * n :]
 
     def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
         """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""
@@ -185,7 +193,7 @@ class SourceSearch:
     ) -> Sources:
         """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
         reach = self._reach(fit.gain.shape[1])
-        gains = (fit.gain * scale[:, None]).repeat(1, 3)
+        gains = repeat_per_coordinate(fit.gain * scale[:, None])
         spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
         return Sources(
             direction, delay, fit.gain * scale[:, None], fit.inverse * (noise * scale**2)[:, None, None],

@@ -19,8 +19,13 @@ from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models.array_vectors import splat_init
-from gsparc.models.array_vectors.cross_validation import tune
-from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements, refine_alignment, twin
+from gsparc.models.array_vectors.cross_validation import choose_kernel
+from gsparc.models.array_vectors.vector_gp import (
+    align_by_likelihood,
+    mirror_elements,
+    refine_alignment,
+    twin_vectors,
+)
 from gsparc.models.registry import method_class
 from gsparc.models.splat.array import ArrayField
 from gsparc.ops import Pose, SphereGrid
@@ -76,10 +81,10 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
-    mixed[::3] = twin(mixed[::3], partner)
+    mixed[::3] = twin_vectors(mixed[::3], partner)
     kernel = Kernel.of_one(0.2, 1e-3, term=SmoothRough)
     inverse = np.linalg.inv(kernel.gram(torch.from_numpy(data.tx)).numpy())
-    vectors = aligned_by(mixed, data.tx, partner, kernel)
+    vectors = align_by_likelihood(mixed, data.tx, partner, kernel)
     left_out = vectors - (inverse @ vectors) / np.diag(inverse)[:, None]
     overlap = np.abs((left_out.conj() * vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
     assert np.median(overlap) > 0.99
@@ -114,7 +119,9 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     images = data.target.reshape(160, -1).astype(np.float32) / 255
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()
     scaled = truth / np.abs(truth @ matrix.conj()).max(1, keepdims=True)
-    chosen = tune(scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array))
+    chosen = choose_kernel(
+        scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array)
+    )
     a, b = fit_errors(chosen.unknown, chosen.error)
     assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
     assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5

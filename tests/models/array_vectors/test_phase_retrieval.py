@@ -12,8 +12,8 @@ from known_arrays import array_site, measure, room_vectors, spectra, walk
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
 from gsparc.models.array_vectors import phase_retrieval, vector_cache
-from gsparc.models.array_vectors.phase_retrieval import recover
-from gsparc.models.array_vectors.vector_gp import mirror_elements, twin
+from gsparc.models.array_vectors.phase_retrieval import recover_vectors
+from gsparc.models.array_vectors.vector_gp import mirror_elements, twin_vectors
 from gsparc.ops import SphereGrid
 
 
@@ -21,12 +21,12 @@ def _agreement(found, truth, partner):
     """|<x, y>| of unit vectors, the better of the two twins."""
     unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found, truth)]
     direct = np.abs((unit[0].conj() * unit[1]).sum(1))
-    return np.maximum(direct, np.abs((twin(unit[0], partner).conj() * unit[1]).sum(1)))
+    return np.maximum(direct, np.abs((twin_vectors(unit[0], partner).conj() * unit[1]).sum(1)))
 
 
 def test_vectors_of_a_traced_room_come_back_and_redraw_its_spectra(known_campaign):
     data, truth = known_campaign
-    found = recover(data.site, data.target[:60], data.tx[:60])
+    found = recover_vectors(data.site, data.target[:60], data.tx[:60])
     image = spectra(data.site, torch.from_numpy(found.vectors)).numpy()
     assert np.sqrt(((image - data.target[:60] / 255.0) ** 2).mean()) < 2 / 255
     assert (found.residual < found.expected).all() and not found.suspect.any()
@@ -48,7 +48,7 @@ def test_a_subtracted_minimum_is_found():
     image = spectra(site, torch.from_numpy(truth)).numpy()
     low, high = image.min((1, 2)), image.max((1, 2))
     published = (image - low[:, None, None]) / (high - low)[:, None, None]
-    found = recover(site, published.astype(np.float32), rng.normal(size=(12, 3)))
+    found = recover_vectors(site, published.astype(np.float32), rng.normal(size=(12, 3)))
     agreement = _agreement(found.vectors, truth, mirror_elements(site.array))
     assert np.median(agreement) > 0.999
     assert np.median(np.abs(found.offset - low / (high - low))) < 2e-3
@@ -66,7 +66,7 @@ def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch
     broken, rows = _spoilt(known_campaign[0], 2), np.arange(4)
     for most in (0, 96):
         starts.clear()
-        recover(broken.site, broken.target[rows], broken.tx[rows], most=most)
+        recover_vectors(broken.site, broken.target[rows], broken.tx[rows], most=most)
         assert (96 in starts) == (most >= 96) and 384 not in starts
 
 
@@ -74,7 +74,7 @@ def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch
 def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, rows):
     data, _ = known_campaign
     images = np.concatenate([data.target[: rows - 1], np.zeros_like(data.target[:1])])
-    found = recover(data.site, images, data.tx[:rows])
+    found = recover_vectors(data.site, images, data.tx[:rows])
     assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
 
 
@@ -82,27 +82,27 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     caplog.set_level("INFO", "gsparc")
     data, _ = known_campaign
     data = replace(data, site=replace(data.site, sha256="fresh"))
-    asked, inner = [], vector_cache.recover
+    asked, inner = [], vector_cache.recover_vectors
     monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
-    monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
-    first, seconds = vector_cache.recovered(data, np.arange(10))
-    again, later = vector_cache.recovered(data, np.arange(5, 25))
+    monkeypatch.setattr(vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a))
+    first, seconds = vector_cache.recover_cached(data, np.arange(10))
+    again, later = vector_cache.recover_cached(data, np.arange(5, 25))
     assert asked == [10, 8, 7] and seconds.wall > 0 and later.wall > seconds.wall / 2
     assert seconds.processor > 0 and seconds.processor / 2 < later.processor
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
     assert "array vectors of 5 spectra were computed before" in caplog.messages
     other = replace(data, site=replace(data.site, sha256="another"))
-    vector_cache.recovered(other, np.arange(3))
-    vector_cache.recovered(other, np.arange(3), seed=1)
+    vector_cache.recover_cached(other, np.arange(3))
+    vector_cache.recover_cached(other, np.arange(3), seed=1)
     assert asked == [10, 8, 7, 3, 3]
 
 
 def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     broken, rows = _spoilt(data, 2), np.arange(4)
-    found = recover(data.site, broken.target[rows], data.tx[rows], most=0)
+    found = recover_vectors(data.site, broken.target[rows], data.tx[rows], most=0)
     assert np.flatnonzero(found.suspect).tolist() == [2]
-    vector_cache.report(found, broken, rows, tmp_path / "array_recovery.csv")
+    vector_cache.write_recovery_report(found, broken, rows, tmp_path / "array_recovery.csv")
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
     assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
 
@@ -110,7 +110,7 @@ def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
 def test_real_spectra_are_sixteen_complex_numbers(real_rfid):
     data = load({"name": "rfid", "root": str(real_rfid)})
     rows = np.arange(40, 80)
-    found = recover(data.site, data.target[rows], data.tx[rows])
+    found = recover_vectors(data.site, data.target[rows], data.tx[rows])
     assert np.median(found.residual) < 1e-3 and not found.suspect.any()
 
 
@@ -120,6 +120,6 @@ def test_an_array_without_mirror_symmetry_has_no_twins_to_confuse():
     tx = walk(20)
     vectors, _ = room_vectors(tx, 1, array)
     data = measure(site, tx, vectors)
-    found = recover(site, data.target, tx)
+    found = recover_vectors(site, data.target, tx)
     unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found.vectors, vectors)]
     assert np.median(np.abs((unit[0].conj() * unit[1]).sum(1))) > 0.999

@@ -15,9 +15,9 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
 from gsparc.models.array_vectors import splat_init
-from gsparc.models.array_vectors.cross_validation import tune
-from gsparc.models.array_vectors.vector_cache import recovered
-from gsparc.models.array_vectors.vector_gp import aligned_by, mirror_elements
+from gsparc.models.array_vectors.cross_validation import choose_kernel
+from gsparc.models.array_vectors.vector_cache import recover_cached
+from gsparc.models.array_vectors.vector_gp import align_by_likelihood, mirror_elements
 from gsparc.models.registry import build
 from gsparc.physics.array_response import steering
 
@@ -48,9 +48,9 @@ def process(trained):
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
-    found, _ = recovered(data, fold.train)  # the same solutions
-    kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
-    vectors = aligned_by(found.vectors, places, partner, kernel)
+    found, _ = recover_cached(data, fold.train)  # the same solutions
+    kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
+    vectors = align_by_likelihood(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
     inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.between(queries, rows).numpy()
     return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
@@ -130,7 +130,7 @@ def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
 def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_path):
     """A field that the receiver does not see emits nothing: all numbers stay finite."""
     data, _ = known_campaign
-    found = splat_init.learn(data, np.arange(20), 1024, 0, tmp_path)
+    found = splat_init.learn_vector_process(data, np.arange(20), 1024, 0, tmp_path)
     method, _, _ = trained
     model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model).made_for(
         data
@@ -140,7 +140,7 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
         model.fitted().gaussians.opacity_logits.fill_(-40.0)
     batch = data.batch(np.arange(1))
     few = replace(found, weights=torch.ones(100, 16, dtype=torch.complex128))
-    splat_init.start(model.fitted(), few, batch.rx)
+    splat_init.set_emissions(model.fitted(), few, batch.rx)
     assert torch.isfinite(model.fitted().emission.weight2).all()
 
 

@@ -16,10 +16,10 @@ from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import with_direction_errors
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP
-from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, flips
+from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import gather
-from gsparc.models.image_sources.scene import steering
+from gsparc.models.image_sources.rows import draw_rows
+from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.processes.kernel import matern32_of_squares
@@ -58,7 +58,7 @@ def test_a_search_starts_from_sources_where_rays_meet():
     found = fitted(data, fold)[0].found()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
-        start = Search(gather(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
+        start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
         assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
     context, init = FitContext(beside={"rays": fitted(data, fold)[0]}), InitSettings()
     assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])
@@ -95,7 +95,9 @@ def test_rows_left_out_are_predicted_as_by_a_fit_without_the_receiver():
     shared = (waves[kept] * given.power) @ waves[kept].mH
     shared *= given.kernel.correlation(rows.position[kept], rows.position[kept])
     shared.diagonal().add_(given.kernel.noise + 1e-5)
-    probability = steering(rows.take(out), given.positions.points) * given.visibility.left_out[k].float()
+    probability = (
+        spherical_waves(rows.take(out), given.positions.points) * given.visibility.left_out[k].float()
+    )
     cross = (probability * given.power) @ waves[kept].mH
     cross *= given.kernel.correlation(rows.position[out], rows.position[kept])
     predicted = cross @ torch.linalg.solve(shared, rows.target[kept])
@@ -169,15 +171,15 @@ def test_a_channel_restores_a_missed_ray():
     rays = truth.clone()
     rays[torch.arange(20), torch.arange(20) % 4] = 0
     left = ((truth - rays)[:, :, None] * one).sum(1)
-    rates = RayErrorRates.first(rays)
+    rates = RayErrorRates.initial(rays)
     assert rates.missed == 0.2  # a quarter, clipped at first
     probability = torch.full((20, 4), 0.75)
-    flip = flips(rays, rates.odds(rays, probability), left, torch.full((20,), 1e-3), one)
+    flip = entries_to_flip(rays, rates.odds(rays, probability), left, torch.full((20,), 1e-3), one)
     assert torch.equal(flip, (truth - rays).bool())
     estimated = RayErrorRates.of(rays, truth)
     assert abs(estimated.missed - 0.25) < 1e-6 and estimated.spurious == 1e-3
     # no neighbour sees it and the residual is zero: noise adds no visibility
-    quiet = flips(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
+    quiet = entries_to_flip(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
     assert not bool(quiet[rays == 0].any())
 
 

@@ -11,15 +11,15 @@ from gains import gains, phased
 from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
-from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.boxes import find_box
-from gsparc.models.image_sources.clutter.finite_mirrors import find_mirrors, find_patch
-from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
+from gsparc.models.image_sources.clutter.finite_mirrors import find_patch, find_small_mirrors
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.known.method import ReflectionPhasePrior
-from gsparc.models.image_sources.query import Means
+from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import all_sequences
@@ -66,7 +66,7 @@ def _boxed(box: torch.Tensor) -> Clutter:
 
 def _table() -> tuple[torch.Tensor, Clutter]:
     """Planes with a table top, and its patch: 1.2 to 2.6 m, 0.8 to 2.2 m."""
-    corners = torch.tensor([[1.2, 0.8, 0.75], [2.6, 2.2, 0.75]]) @ tangents(TABLE).T
+    corners = torch.tensor([[1.2, 0.8, 0.75], [2.6, 2.2, 0.75]]) @ plane_tangents(TABLE).T
     patch = torch.cat([corners.amin(0), corners.amax(0)])
     return torch.cat([WALLS, TABLE[None]]), Clutter(torch.zeros(0, 6), patch[None], (6,))
 
@@ -75,7 +75,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
     told, _, _ = shoebox(150, pillar=True, snr_db=60.0)
     scene = _scene(_boxed(_box()), order=2)
     places = torch.from_numpy(told.rx.copy())
-    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes, soft=1e-4).T.numpy()
+    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes).T.numpy()
     true = told.images.of(told.tx[0])
     at_noise_floor = 0.0
     for k, source in enumerate(scene.sources.numpy()):
@@ -117,7 +117,7 @@ def test_concatenated_scenes_do_not_interact():
     one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
     two = _scene(_boxed(_box()))
     members = [Posterior(_rows(3), phased(each, torch.zeros(len(each.sequences)))) for each in (one, two)]
-    together = Means(members).visible_share(places)
+    together = EnsembleMeans(members).visible_share(places)
     torch.testing.assert_close(
         together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
     )
@@ -129,19 +129,19 @@ def test_batched_queries_and_variance_include_clutter():
     members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    means, variance, _ = Means(members).means(queries, tone)
+    means, variance, _ = EnsembleMeans(members).means(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
-        waves = member.scene.over(member.scene.sequences).unobstructed(asked)
+        waves = member.scene.with_other_sequences(member.scene.sequences).unobstructed_waves(asked)
         expected = (waves[:, :, None] * gains(member, queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
-    bare = Means(members[1:]).means(queries, tone)[1]
+    bare = EnsembleMeans(members[1:]).means(queries, tone)[1]
     assert not torch.allclose(variance, bare)
 
 
 def test_residual_is_the_same_likelihood():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    residual = Residual(rows, phased(_scene(_boxed(_box())), torch.arange(7.0)))
+    residual = ClutterLikelihood(rows, phased(_scene(_boxed(_box())), torch.arange(7.0)))
     scene = residual.scene
     seen = scene.visible_share(rows.position).T
     expected = Posterior(rows, residual.scene).nll
@@ -153,7 +153,7 @@ def test_score_is_what_the_best_multiple_gains():
     left = _unexplained(rows, _bare())
     scene, scorer = left.scene, left.scorer
     change = torch.randn(20, 8, dtype=torch.complex64)
-    score, multiple = scorer.score_positive(change)
+    score, multiple = scorer.gain_of_positive_multiples(change)
     best = int(score.argmax())
     moved = replace(rows, target=rows.target - (multiple[best] * change[:, best])[:, None])
     gain = Posterior(rows, scene).nll - Posterior(moved, scene).nll
@@ -181,16 +181,16 @@ def _bare(sources: int = 7) -> Scene:
     return phased(_scene(Clutter.none()), torch.zeros(sources))
 
 
-def _unexplained(rows: Rows, start: Scene) -> Unexplained:
+def _unexplained(rows: Rows, start: Scene) -> UnexplainedRows:
     """What is left of rows by a scene without clutter, with its noise."""
-    residual = Residual(rows, start)
+    residual = ClutterLikelihood(rows, start)
     scene, paths = residual.scene, start.unfolding.paths(rows.position)
     scorer = residual.scorer(torch.ones(len(start.sequences), len(rows)), scene.log_amplitude)
-    waves, generator = start.unobstructed(rows), torch.Generator().manual_seed(0)
-    return Unexplained(rows, scene, scorer, paths, waves, _room(), generator)
+    waves, generator = start.unobstructed_waves(rows), torch.Generator().manual_seed(0)
+    return UnexplainedRows(rows, scene, scorer, paths, waves, _room(), generator)
 
 
-def _beside_a_table(count: int) -> tuple[Unexplained, Clutter]:
+def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     """What walls leave unexplained of rows in a room with a table, and the table."""
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
@@ -201,7 +201,7 @@ def _beside_a_table(count: int) -> tuple[Unexplained, Clutter]:
 
 def test_a_table_top_is_found_by_its_reflections():
     left, clutter = _beside_a_table(200)
-    best = find_mirrors(left, 3)[0]
+    best = find_small_mirrors(left, 3)[0]
     assert best.plane[2].abs() == 1 and best.score > 15
     assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
     found, true = (patch.view(2, 2).mean(0) for patch in (best.patch, clutter.patches[0]))
@@ -211,12 +211,12 @@ def test_a_table_top_is_found_by_its_reflections():
 def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
     """A raster of 35 cm cells over 40 km asked for six terabytes."""
     left, _ = _beside_a_table(60)
-    whole = find_mirrors(left, 3)
+    whole = find_small_mirrors(left, 3)
     monkeypatch.setattr(finite_mirrors, "BLOCK_CELLS", 2e4)  # the raster in parts is the same
-    parts = find_mirrors(left, 3)
+    parts = find_small_mirrors(left, 3)
     assert len(whole) > 0 and [m.score for m in parts] == [m.score for m in whole]
     with caplog.at_level("INFO"):
-        assert find_mirrors(replace(left, room=1e4 * _room()), 3) == []
+        assert find_small_mirrors(replace(left, room=1e4 * _room()), 3) == []
     assert "no search for small mirrors" in caplog.text
 
 
@@ -230,7 +230,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         return spent[-1] > spent[0] + 0.5
 
     with cancelled_by(unwanted), pytest.raises(Cancelled):
-        find_mirrors(replace(left, room=4 * _room()), 3)
+        find_small_mirrors(replace(left, room=4 * _room()), 3)
     assert max(np.diff([*spent, time.thread_time()])) < 0.5
     room, cells = 20 * _room(), []
 
@@ -241,7 +241,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finite_mirrors, "_raster", nothing)
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
-        find_mirrors(replace(left, room=room, scene=left.scene.only([0, 1])), 3)
+        find_small_mirrors(replace(left, room=room, scene=left.scene.only([0, 1])), 3)
     count = sum(planes for planes, _ in cells) * math.prod(
         finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[0]), cells[0][1])
     )

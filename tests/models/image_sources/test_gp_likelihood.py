@@ -8,9 +8,13 @@ from gains import gains, phased
 
 from gsparc.models.image_sources import refine
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.query import Means
+from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, correlations, steering
+from gsparc.models.image_sources.scene import (
+    KernelVisibility,
+    Scene,
+    spherical_waves,
+)
 from gsparc.processes.kernel import matern32_of_squares
 
 COUNT = 24
@@ -45,7 +49,7 @@ def _phased(quadrature: float = 0.2) -> Scene:
 
 def test_covariance_by_the_formula():
     rows, scene = _rows(), _scene()
-    waves = steering(rows, scene.sources)
+    waves = spherical_waves(rows, scene.sources)
     expected = torch.eye(COUNT, dtype=torch.complex64) * (torch.tensor(-1.0).exp() + 1e-5)
     for k, source in enumerate(scene.sources):
         correlation = scene.visibility.correlation(rows.position, source)
@@ -79,7 +83,7 @@ def test_left_out_by_refitting_without_the_receiver(quadrature):
         mine = rows.receiver == receiver
         rest = Posterior(rows.take(torch.nonzero(~mine)[:, 0]), scene)
         held = rows.take(torch.nonzero(mine)[:, 0])
-        waves = steering(held, scene.sources)
+        waves = spherical_waves(held, scene.sources)
         predicted = (waves[:, :, None] * gains(rest, held.position)).sum(1)
         torch.testing.assert_close(left_out[mine], predicted, rtol=1e-3, atol=1e-3)
 
@@ -87,36 +91,37 @@ def test_left_out_by_refitting_without_the_receiver(quadrature):
 @pytest.mark.parametrize("make", [_scene, _phased])
 def test_slopes_of_the_likelihood_which_refining_raises(make):
     rows, scene = _rows(), make()
-    seen = correlations(rows, scene.sources, scene.visibility)
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
+    seen = torch.stack([scene.visibility.correlation(rows.places, source) for source in scene.sources])
+    values = [scene.transmitter, *scene.planes.split((3, 1), 1), scene.log_amplitude]
+    values += [torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
-    nll, gradient = refine._likelihood(rows, scene, values, seen)
+    nll, gradient = refine._objective(rows, scene, values, seen)
     assert nll == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
     for i, value in enumerate(values):
-        step = 3e-4 if i < 2 else 2e-2
+        step = 3e-4 if i < 3 else 2e-2
         for j in range(min(value.numel(), 4)):
             ends = []
             for sign in (1, -1):
                 moved = [v.clone() for v in values]
                 moved[i].view(-1)[j] += sign * step
-                ends.append(refine._likelihood(rows, scene, moved, seen)[0])
+                ends.append(refine._objective(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
-    assert Posterior(rows, refine.refine(rows, scene, 8)).nll < nll
+    assert Posterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
 
 
 def test_packed_queries_equal_the_processes():
     members = [Posterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
     tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
     queries = torch.rand(7, 3, dtype=torch.float64) * 3
-    means, _, _ = Means(members).means(queries, tones)
-    bare, variance, prior = Means(members, variance_rows=0).means(queries, tones)
+    means, _, _ = EnsembleMeans(members).means(queries, tones)
+    bare, variance, prior = EnsembleMeans(members, variance_rows=0).means(queries, tones)
     assert torch.equal(bare, means) and variance.tolist() == [0] * 7 and prior.tolist() == [1] * 7
     for member, mean in zip(members, means, strict=True):
         found = gains(member, queries)
         for f, tone in enumerate(tones):
             asked = Rows(queries, tone.expand(7), torch.empty(7, 0), torch.arange(7))
-            expected = (steering(asked, member.scene.sources)[:, :, None] * found).sum(1)
+            expected = (spherical_waves(asked, member.scene.sources)[:, :, None] * found).sum(1)
             torch.testing.assert_close(mean[:, :, f], expected, rtol=1e-3, atol=1e-4)
 
 
@@ -125,7 +130,7 @@ def test_variance_is_that_of_the_joint_gaussian():
     rows, scene = _rows(), _phased()
     query = torch.tensor([[1.0, 1.2, 0.4]], dtype=torch.float64)
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    _, variance, _ = Means([Posterior(rows, scene)]).means(query, tone)
+    _, variance, _ = EnsembleMeans([Posterior(rows, scene)]).means(query, tone)
     both = Rows(
         torch.cat([rows.position, query]),
         torch.cat([rows.frequency, tone]),
@@ -140,13 +145,13 @@ def test_variance_is_that_of_the_joint_gaussian():
 def test_variances_of_many_queries_are_those_of_each_alone():
     tones = torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
-    query = Means([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
+    query = EnsembleMeans([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
     _, variance, prior = query.means(queries, tones)
     alone = [query.means(one[None], tones)[1:] for one in queries]
     torch.testing.assert_close(
         torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
     )
-    whole = Means([Posterior(_rows(), _phased())]).means(queries, tones)[1]
+    whole = EnsembleMeans([Posterior(_rows(), _phased())]).means(queries, tones)[1]
     assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
     assert bool((variance <= prior).all())
 

@@ -12,14 +12,14 @@ from gains import fitted, phased
 from scenes import error, fold_of
 
 from gsparc.data.own import from_arrays
-from gsparc.models.image_sources.backprojection import quick_score, score
-from gsparc.models.image_sources.clutter.residual import Residual, _cost
-from gsparc.models.image_sources.gp_likelihood import Posterior, with_phases
+from gsparc.models.image_sources.backprojection import likelihood_gain, rough_likelihood_gain
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _cost
+from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.refine import refine
-from gsparc.models.image_sources.rows import gather, static_array
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, steering
-from gsparc.physics.mirror_planes import bisector, images, orientations, reflect
+from gsparc.models.image_sources.refine import refine_scene
+from gsparc.models.image_sources.rows import draw_rows, static_array
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, spherical_waves
+from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext
 
@@ -112,7 +112,7 @@ def test_orientation_of_first_and_second_order():
     planes = torch.randn(3, 4, generator=draws, dtype=torch.float64)
     centre, antenna = torch.randn(2, 3, generator=draws, dtype=torch.float64)
     sequences = [(), (0,), (2,), (0, 1), (2, 1)]
-    turned = orientations(planes, sequences)
+    turned = image_rotations(planes, sequences)
     torch.testing.assert_close(
         images(centre + antenna, planes, sequences), images(centre, planes, sequences) + turned @ antenna
     )
@@ -128,7 +128,7 @@ def test_orientation_of_first_and_second_order():
 
 def _rows_and_scene():
     data, fold = _uplink(40)
-    rows = gather(data, fold.train, 100, 0)
+    rows = draw_rows(data, fold.train, 100, 0)
     static = torch.from_numpy(data.site.static_position)
     planes = torch.tensor([[1.0, 0, 0, -data.site.origin[0]]]).double()
     scene = Scene(static, planes, ((), (0,)), torch.zeros(2), -5.0)
@@ -140,19 +140,19 @@ def test_gradient_by_planes_and_position_is_that_of_the_likelihood():
     assert len(rows) <= 100 and len(rows.element.unique()) == 4
     moved = replace(scene, planes=scene.planes + torch.tensor([0, 0, 0, 0.004]).double())
     before = Posterior(rows, moved).nll
-    assert Posterior(rows, refine(rows, moved, 10)).nll < before - 1
+    assert Posterior(rows, refine_scene(rows, moved, 10)).nll < before - 1
 
 
 def test_quick_scores_of_an_array_are_those_without_a_covariance():
     rows, scene = _rows_and_scene()
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() + 3
     spread = reflect(rows.static_ends(scene.transmitter)[:, None], bisector(scene.transmitter, points))
-    waves = steering(rows, spread)
+    waves = spherical_waves(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
-    torch.testing.assert_close(quick_score(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert score(Posterior(rows, scene), spread)[0].shape == (300,)
+    torch.testing.assert_close(rough_likelihood_gain(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
+    assert likelihood_gain(Posterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
-        steering(rows, points)
+        spherical_waves(rows, points)
 
 
 def test_rotated_array_and_tones(tmp_path):
@@ -181,7 +181,7 @@ def test_antennas_with_phases_of_their_own(tmp_path):
 
 def test_antennas_of_unknown_places_are_outputs_of_their_own():
     data, fold = _uplink(30, antennas=2)
-    rows = gather(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
+    rows = draw_rows(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
 
 
@@ -213,7 +213,7 @@ def test_ofdm_with_hardly_any_noise(tmp_path):
 
 def test_rows_draw_antennas_so_that_places_are_many():
     data, fold = _ofdm(60, 1e-3)
-    rows = gather(data, fold.train, 2 * len(fold.train), 0)
+    rows = draw_rows(data, fold.train, 2 * len(fold.train), 0)
     assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
 
 
@@ -229,7 +229,7 @@ def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():
 def test_clutter_is_looked_for_without_noise():
     rows, scene = _rows_and_scene()
     silent = replace(scene, log_noise=-40.0, visibility=KernelVisibility(0.999, 5.0, 50.0))
-    again = Residual(rows, phased(silent, torch.zeros(2), 0.15))
+    again = ClutterLikelihood(rows, phased(silent, torch.zeros(2), 0.15))
     assert np.isfinite(again.nll(torch.ones(2, len(rows)), silent.log_amplitude).item())
 
 
@@ -262,5 +262,5 @@ def test_one_antenna_is_a_case_of_several():
     mine = rows.take(torch.nonzero(rows.element == 0).flatten())
     alone = replace(mine, array=None, element=None)
     assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
-    one, other = (Posterior(each, with_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))
+    one, other = (Posterior(each, estimate_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))
     assert one == pytest.approx(other, rel=1e-4)

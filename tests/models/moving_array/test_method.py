@@ -13,9 +13,9 @@ from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, powers
+from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, nonnegative_powers
 from gsparc.ops import SphereGrid
-from gsparc.physics.lags import Lags
+from gsparc.physics.lags import SpectrumLags
 from gsparc.simulate.shoebox import images
 from gsparc.training.context import FitContext
 
@@ -48,7 +48,7 @@ def fitted(data, fold, tmp_path_factory):
 def test_the_strong_images_are_found(data):
     """The transmitter and images in the near walls, from pictures alone; the far ones are 14 dB weaker."""
     site = data.site
-    space = Lags(site.array, site.grid, site.wavelength)
+    space = SpectrumLags(site.array, site.grid, site.wavelength)
     power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
     receivers = torch.from_numpy(data.moving[:60]).float()
     given = space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
@@ -64,7 +64,7 @@ def test_a_search_ends_with_its_seconds():
     rng = np.random.default_rng(0)
     grid = SphereGrid.hemisphere(15, 60)
     array = np.c_[np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4), np.zeros(16)] * 0.06
-    space = Lags(array, grid, 0.125)
+    space = SpectrumLags(array, grid, 0.125)
     power = torch.from_numpy(rng.uniform(size=(20, 15, 60)).astype(np.float32))
     receivers = torch.from_numpy(rng.uniform(size=(20, 3)).astype(np.float32))
     settings = dataclasses.replace(SEARCH, sources=40, per_round=4, least_gain=0.0)
@@ -101,7 +101,7 @@ def test_a_search_ends_when_the_seconds_are_over(data, fold, tmp_path):
 def test_powers_are_the_best_that_are_not_negative():
     rng = np.random.default_rng(0)
     atoms, lags = (torch.from_numpy(rng.normal(size=s)).float() for s in ((3, 6, 20), (3, 20)))
-    found = powers(lags, atoms, 0.1).numpy()
+    found = nonnegative_powers(lags, atoms, 0.1).numpy()
     for row, one, asked in zip(found, atoms.numpy(), lags.numpy(), strict=True):
         stacked = np.vstack([one.T, np.sqrt(0.1) * np.eye(6)])
         np.testing.assert_allclose(row, nnls(stacked, np.r_[asked, np.zeros(6)])[0], atol=1e-3)

@@ -16,7 +16,7 @@ from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
-from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
+from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
 from gsparc.training.context import FitContext
 
 
@@ -174,7 +174,9 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
         direction, delay = three.direction.double().clone(), three.delay.double().clone()
         direction, delay = direction + moved[:2], delay + moved[2]
         exact = Aperture(aperture.places.double(), aperture.tones.double())
-        return (steering(direction, exact)[..., None] * delays(delay, exact)[:, :, None]).flatten(2)[0]
+        return (
+            antenna_responses(direction, exact)[..., None] * tone_responses(delay, exact)[:, :, None]
+        ).flatten(2)[0]
 
     step = 1e-6
     slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]

@@ -8,8 +8,8 @@ import torch
 from gsparc.apps.export.compiled.blob import Form
 from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.query import Means
-from gsparc.models.image_sources.rows import elements, static_array
+from gsparc.models.image_sources.query import EnsembleMeans
+from gsparc.models.image_sources.rows import antenna_positions, static_array
 from gsparc.physics.waves import evenly_spaced
 
 # 16 float32 are the widest register; narrower ones take the same rows in two or four steps.
@@ -18,7 +18,7 @@ LANES = 16
 BEYOND = 1e6  # [m], a place that is near none
 
 
-def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
+def sources_form(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> Form:
     """Return the form of an ensemble's sources without clutter, whose gains `query` has."""
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(query.sources), len(query.places)
@@ -28,7 +28,7 @@ def sources_form(method: ImageSourceGP, site: Site, query: Means) -> Form:
     # The pose of a receiver turns its array with it; a transmitter's array stands in the site's frame.
     if site.moving_end == "rx":
         turned = torch.from_numpy(np.asarray(rotation, np.float32)).double()[None]
-        moving = elements(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
+        moving = antenna_positions(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
     images = query.sources[None]
     if array is not None:
         images = images + torch.einsum("kij,ej->eki", query.orientations, torch.from_numpy(array))

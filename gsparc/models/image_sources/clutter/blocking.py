@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.clutter.unfold import EDGE, Paths
+from gsparc.physics.mirror_planes import normal_form
 
 MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
-SOFT = 0.02  # [m], width of a soft edge
-NEAR_PLANE = 0.02  # [m]; a leg that ends this close to a patch is reflected by it, not blocked
+SOFT = 0.02  # [m], width of a soft edge; a leg that ends nearer to a patch is reflected by it, not blocked
+BOX, PATCH = 6, 4  # numbers of each: coordinates of two corners in space, on a plane
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Clutter:
 
     Attributes:
         boxes: (B, 6) float32 [m], lower then upper corners.
-        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `tangents`.
+        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `plane_tangents`.
         plane: Q indices of planes of the scene.
     """
 
@@ -36,15 +38,14 @@ class Clutter:
     @staticmethod
     def none() -> Clutter:
         """Return clutter of no boxes and infinite mirrors."""
-        return Clutter(torch.zeros(0, 6), torch.zeros(0, 4), ())
+        return Clutter(torch.zeros(0, BOX), torch.zeros(0, PATCH), ())
 
     def __len__(self) -> int:
         return len(self.boxes) + len(self.patches)
 
-    def with_box(self, box: Tensor, at: int | None = None) -> Clutter:
-        """Return it with one more box (6,), in place `at`."""
-        at = len(self.boxes) if at is None else at
-        return replace(self, boxes=torch.cat([self.boxes[:at], box[None], self.boxes[at:]]))
+    def with_box(self, box: Tensor) -> Clutter:
+        """Return it with one more box (6,)."""
+        return replace(self, boxes=torch.cat([self.boxes, box[None]]))
 
     def with_patch(self, patch: Tensor, plane: int) -> Clutter:
         """Return it with one more patch (4,)."""
@@ -57,15 +58,15 @@ class Clutter:
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
-    def renamed(self, new: dict[int, int]) -> Clutter:
+    def with_planes_renumbered(self, new: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
         patches = [i for i, plane in enumerate(self.plane) if plane in new]
         return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
 
 
-def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
+def visible_share(paths: Paths, clutter: Clutter, planes: Tensor) -> Tensor:
     """Return the visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
-    return Obstacles(clutter, planes).visible_share(paths, soft)
+    return Obstacles(clutter, planes).visible_share(paths)
 
 
 class Obstacles:
@@ -85,29 +86,29 @@ class Obstacles:
         self.ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
         self.ends[plane] = True
         used, self.boxes, self.patches = planes[plane], clutter.boxes, clutter.patches
-        axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
-        self.plane, self.offset = plane.view(-1, 1, 1, 1), used[:, 3].float().view(-1, 1, 1, 1)
-        self.axes = torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3)
+        normal, offset = (part.float() for part in normal_form(used))
+        self.plane, self.offset = plane.view(-1, 1, 1, 1), offset.view(-1, 1, 1, 1)
+        self.axes = torch.cat([normal[None], plane_tangents(used)])
 
-    def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
+    def visible_share(self, paths: Paths) -> Tensor:
         """Return the visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
-            seen = seen * past_boxes(paths, self.boxes, soft).prod(0)
+            seen = seen * share_past_boxes(paths, self.boxes).prod(0)
         if len(self.patches):
-            seen = seen * self._past_patches(paths, soft)
+            seen = seen * self._past_patches(paths)
         return seen
 
-    def _past_patches(self, paths: Paths, soft: float) -> Tensor:
+    def _past_patches(self, paths: Paths) -> Tensor:
         turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
-        height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
+        height, *place = turned.unflatten(0, self.axes.shape[:2])  # each (Q, K, n, L + 1)
         height = height - self.offset
-        away, (above, below) = height.abs() > NEAR_PLANE, (height[..., :-1], height[..., 1:])
+        away, (above, below) = height.abs() > SOFT, (height[..., :-1], height[..., 1:])
         ends_here = paths.plane == self.plane
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
-        outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & paths.valid[..., None])
+        outside = 1 - _inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.plane]
@@ -116,45 +117,40 @@ class Obstacles:
         return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
 
 
-def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
+def share_past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
     """Return the share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
-    along = torch.where(along.abs() < 1e-6, 1e-6, along)
+    along = torch.where(along.abs() < EDGE, EDGE, along)
     inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
     enter, leave = torch.zeros(()), torch.ones(())
-    for axis in range(3):
-        low, high = boxes[:, axis::3].T.reshape(2, -1, 1, 1, 1)
-        one = (low - paths.start[..., axis]) * inverse[..., axis]
-        other = (high - paths.start[..., axis]) * inverse[..., axis]
+    corners = (each[:, None, None, None].unbind(-1) for each in boxes.chunk(2, 1))
+    for start, per_metre, low, high in zip(paths.start.unbind(-1), inverse.unbind(-1), *corners, strict=True):
+        one, other = (low - start) * per_metre, (high - start) * per_metre
         enter = torch.maximum(enter, torch.minimum(one, other))
         leave = torch.minimum(leave, torch.maximum(one, other))
     chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
-    passed = torch.sigmoid((MARGIN - chord) / soft)
+    passed = torch.sigmoid((MARGIN - chord) / SOFT)
     return torch.where(paths.valid, passed, 1.0)
 
 
-def within(points: Tensor, patches: Tensor) -> Tensor:
+def share_inside_patches(points: Tensor, patches: Tensor) -> Tensor:
     """Return the soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
-    return _inside([points[None, ..., 0], points[None, ..., 1]], patches, SOFT)
+    return _inside([points[None, ..., 0], points[None, ..., 1]], patches)
 
 
-def _inside(place: list[Tensor], patches: Tensor, soft: float) -> Tensor:
+def _inside(place: list[Tensor], patches: Tensor) -> Tensor:
     """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
     u, v = place
-    low_u, low_v, high_u, high_v = patches.T.reshape(4, -1, *[1] * (u.dim() - 1))
+    low_u, low_v, high_u, high_v = (each.reshape(-1, *[1] * (u.dim() - 1)) for each in patches.T)
     inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
-    return torch.sigmoid(inner / soft)
+    return torch.sigmoid(inner / SOFT)
 
 
-def tangents(plane: Tensor) -> Tensor:
-    """Return two axes (2, 3) float32 along a plane (4,): level where they can be."""
-    normal = _units(plane[None])[0]
+def plane_tangents(planes: Tensor) -> Tensor:
+    """Return two unit axes (2, ..., 3) float32 along planes (..., 4): level where they can be."""
+    normal = normal_form(planes)[0].float()
     up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
-    first = ahead if normal[2].abs() > 0.7 else torch.linalg.cross(up, normal)
-    first = first - (first @ normal) * normal
-    first = first / first.norm()
+    level = (normal * up).sum(-1, keepdim=True).abs() > 0.7
+    first = torch.where(level, ahead, torch.linalg.cross(up.expand_as(normal), normal))
+    first = normalize(first - (first * normal).sum(-1, keepdim=True) * normal, dim=-1)
     return torch.stack([first, torch.linalg.cross(normal, first)])
-
-
-def _units(planes: Tensor) -> Tensor:
-    return (planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)).float()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import past_boxes
-from gsparc.models.image_sources.clutter.residual import Unexplained
+from gsparc.models.image_sources.clutter.blocking import MARGIN, share_past_boxes
+from gsparc.models.image_sources.clutter.residual import UnexplainedRows
+from gsparc.physics.draws import draw_in_box, draw_sides
 
-THINNEST = 0.03  # [m]
+THINNEST = MARGIN  # [m]: thinner ones block nothing
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
 TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
 PARENTS, CHILDREN = 12, 6  # of the evolution strategy; children of each parent and round
@@ -20,7 +20,7 @@ HALVED = (4, 8)  # rounds after which only the better half is kept
 STRONGEST = 24  # number of sources that a box is searched with
 
 
-def evolve(
+def maximise_by_evolution(
     parents: Tensor,
     score: Callable[[Tensor], Tensor],
     repaired: Callable[[Tensor], Tensor],
@@ -45,38 +45,40 @@ def evolve(
     return parents[first], float(best[first])
 
 
-def find_box(left: Unexplained, draws: int = 1000) -> tuple[Tensor, float]:
+def find_box(unexplained: UnexplainedRows, draws: int = 1000) -> tuple[Tensor, float]:
     """Return the box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
-        left: what a shadow may explain.
+        unexplained: what a shadow may explain.
         draws: random boxes, of which the best evolve.
     """
-    waves = left.waves * left.scorer.gains
+    waves = unexplained.waves * unexplained.scorer.gains
     chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
-    few, waves = left.paths.take(chosen), waves[:, chosen]
+    few, waves = unexplained.paths.take(chosen), waves[:, chosen]
 
     def score(boxes: Tensor) -> Tensor:
-        return left.scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
+        return unexplained.scorer.gain_of_shares(boxes, lambda part: share_past_boxes(few, part) - 1, waves)
 
     def repaired(boxes: Tensor) -> Tensor:
-        return clipped_to(boxes, left.room)
+        return clip_boxes(boxes, unexplained.room)
 
-    starts = repaired(_random(draws, left.room, left.generator))
+    starts = repaired(_random(draws, unexplained.room, unexplained.generator))
     starts = starts[score(starts).topk(min(PARENTS, draws)).indices]
-    return evolve(starts, score, repaired, left.generator)
+    return maximise_by_evolution(starts, score, repaired, unexplained.generator)
 
 
-def clipped_to(boxes: Tensor, room: Tensor) -> Tensor:
+def clip_boxes(boxes: Tensor, room: Tensor) -> Tensor:
     """Return boxes (m, 6) cut to the room; of one outside, low corners lie above high ones."""
-    low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
-    return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
+    low, high = boxes.chunk(2, 1)
+    low = torch.minimum(low, high - THINNEST)
+    return torch.cat([torch.maximum(low, room[0]), torch.minimum(high, room[1])], 1)
 
 
 def _random(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
-    middle = room[0] + (room[1] - room[0]) * torch.rand(count, 3, generator=generator)
+    lowest, highest = room
+    middle = draw_in_box(lowest, highest, count, generator)
     kind = torch.rand(count, generator=generator)
-    size = SMALLEST * torch.exp(torch.rand(count, 3, generator=generator) * math.log(LARGEST / SMALLEST))
+    size = draw_sides(SMALLEST, LARGEST, middle, generator)
     size[kind < TABLES, 2] = 2 * THINNEST
     low, high = middle - size / 2, middle + size / 2
     low[kind > FLOOR, 2] = room[0, 2]

@@ -14,12 +14,13 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.blocking import tangents, within
-from gsparc.models.image_sources.clutter.boxes import evolve
-from gsparc.models.image_sources.clutter.residual import Unexplained
+from gsparc.models.image_sources.clutter.blocking import plane_tangents, share_inside_patches
+from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
+from gsparc.models.image_sources.clutter.residual import UnexplainedRows
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import steering
-from gsparc.physics.mirror_planes import reflect
+from gsparc.models.image_sources.scene import spherical_waves
+from gsparc.physics.draws import draw_in_box, draw_sides
+from gsparc.physics.mirror_planes import normal_form, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -39,29 +40,30 @@ BLOCK_CELLS = 1e6  # of the rasters held at a time, four numbers each
 MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
-def find_patch(left: Unexplained, number: int) -> tuple[Tensor, float]:
+def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]:
     """Return the patch (4,) on a plane that explains most if sequences end on it alone, and its nats."""
-    mine = [k for k, sequence in enumerate(left.scene.sequences) if number in sequence]
-    few, waves = left.paths.take(mine), left.waves[:, mine]
-    along = tangents(left.scene.planes[number])
-    met, here = few.end @ along.T, few.plane == number
-    ends = left.room @ along.T
+    mine = [k for k, sequence in enumerate(unexplained.scene.sequences) if plane in sequence]
+    few, waves = unexplained.paths.take(mine), unexplained.waves[:, mine]
+    along = plane_tangents(unexplained.scene.planes[plane])
+    met, here = few.end @ along.T, few.plane == plane
+    ends = unexplained.room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
     def score(patches: Tensor) -> Tensor:
-        return left.scorer.score_shares(
-            patches, lambda part: torch.where(here, within(met, part), 1.0).prod(-1), waves
+        return unexplained.scorer.gain_of_shares(
+            patches, lambda part: torch.where(here, share_inside_patches(met, part), 1.0).prod(-1), waves
         )
 
     def repaired(patches: Tensor) -> Tensor:
-        lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
-        return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
+        lower, upper = patches.chunk(2, 1)
+        lower = torch.minimum(lower, upper - MIN_SIDE)
+        return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
-    middle = low + (high - low) * torch.rand(DRAWS, 2, generator=left.generator)
-    side = SMALLEST * torch.exp(torch.rand(DRAWS, 2, generator=left.generator) * math.log(LARGEST / SMALLEST))
+    middle = draw_in_box(low, high, DRAWS, unexplained.generator)
+    side = draw_sides(SMALLEST, LARGEST, middle, unexplained.generator)
     starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[score(starts).topk(8).indices]
-    return evolve(starts, score, repaired, left.generator, rounds=10)
+    return maximise_by_evolution(starts, score, repaired, unexplained.generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -78,16 +80,16 @@ class SmallMirror:
     patch: Tensor
     score: float
 
-    def same(self, other: SmallMirror, apart: float) -> bool:
+    def overlaps(self, other: SmallMirror, apart: float) -> bool:
         """Whether both are parallel, closer than `apart` [m] and overlap."""
-        parallel = (self.plane[:3] @ other.plane[:3]).abs() >= PARALLEL
-        if not parallel or (self.plane[3] - other.plane[3]).abs() > apart:
+        (normal, offset), (normal2, offset2) = map(normal_form, (self.plane, other.plane))
+        if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > apart:
             return False
         low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
         return bool((high > low).all())
 
 
-def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
+def find_small_mirrors(unexplained: UnexplainedRows, most: int) -> list[SmallMirror]:
     """Return at most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
@@ -95,12 +97,12 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
     """
-    rows, room, known = left.rows, left.room, left.scene.planes[left.scene.walls]
+    rows, room, known = unexplained.rows, unexplained.room, unexplained.scene.planes[unexplained.scene.walls]
     wavelength = LIGHT / float(rows.frequency.mean())
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
     for plane in known:
-        normal = plane[:3] / plane[:3].norm()
+        normal, _ = normal_form(plane)
         if any((normal @ other).abs() >= PARALLEL for other in normals):
             continue
         normals.append(normal)
@@ -108,16 +110,16 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
         offsets = torch.arange(
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
         )
-        candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
+        candidates = torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1)
         many = 1 + 2 * len(known)
-        count = math.prod(_cells(room, tangents(candidates[0]), CELL)) * many * len(candidates)
+        count = math.prod(_cells(room, plane_tangents(candidates[0]), CELL)) * many * len(candidates)
         if count > MAX_CELLS:
             log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
             continue
         cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
-        each = max(math.prod(_cells(room, tangents(candidates[0]), cell)), len(rows)) * many
+        each = max(math.prod(_cells(room, plane_tangents(candidates[0]), cell)), len(rows)) * many
         blocks = candidates.split(max(1, int(BLOCK_CELLS / each)))
-        parts = [_raster(left, block, known, cell) for block in blocks]
+        parts = [_raster(unexplained, block, known, cell) for block in blocks]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
@@ -127,17 +129,19 @@ def find_mirrors(left: Unexplained, most: int) -> list[SmallMirror]:
 def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
     apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(mirror.same(other, least) for other in apart):
+        if not any(mirror.overlaps(other, least) for other in apart):
             apart.append(mirror)
     return apart
 
 
-def _raster(left: Unexplained, candidates: Tensor, known: Tensor, cell: float) -> tuple[Tensor, Tensor]:
+def _raster(
+    unexplained: UnexplainedRows, candidates: Tensor, known: Tensor, cell: float
+) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
-    along = tangents(candidates[0])
-    low, cells = (left.room @ along.T).amin(0), _cells(left.room, along, cell)
-    tables, alpha, scale = [], left.scorer.alpha, left.scorer.scale
-    for arriving, met in _sources(left.rows, left.scene.transmitter, candidates, known):
+    along = plane_tangents(candidates[0])
+    low, cells = (unexplained.room @ along.T).amin(0), _cells(unexplained.room, along, cell)
+    tables, alpha, scale = [], unexplained.scorer.alpha, unexplained.scorer.scale
+    for arriving, met in _sources(unexplained.rows, unexplained.scene.transmitter, candidates, known):
         raise_if_cancelled()
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
@@ -148,7 +152,7 @@ def _raster(left: Unexplained, candidates: Tensor, known: Tensor, cell: float) -
         tables.append(binned)
     stacked = (torch.stack(each).cumsum(-1).cumsum(-2) for each in zip(*tables, strict=True))
     sums = [torch.nn.functional.pad(each, (1, 0, 1, 0)) for each in stacked]  # integral images
-    total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
+    total, best = torch.zeros(len(candidates)), torch.zeros(candidates.shape)
     # a few cells, or all there are: a wall that was missed
     sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
     for wide, high_by in product(*sizes):
@@ -183,10 +187,10 @@ def _sources(
     meetings = [_meeting(places, once, candidates)]
     for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
         meetings.append(_meeting(places, after, candidates))
-        first = _meeting(places, before, wall[None].expand(len(candidates), 4))
+        first = _meeting(places, before, wall.expand_as(candidates))
         meetings.append(_meeting(first, once, candidates))
     sources = _images(rows.static_ends(transmitter), candidates, known)
-    return [(steering(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
+    return [(spherical_waves(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
 
 
 def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
@@ -199,9 +203,8 @@ def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
     """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
-    normal, offset = planes[:, None, :3].float(), planes[:, None, 3].float()
-    end = end[:, None].float()
+    normal, offset = (part.float() for part in normal_form(planes[:, None]))
+    offset, end = offset[..., 0], end[:, None].float()
     above, below = (start * normal).sum(-1) - offset, (end * normal).sum(-1) - offset
-    share = above / torch.where((above - below).abs() < 1e-6, torch.ones_like(above), above - below)
-    share = torch.where((above * below < 0), share, torch.full_like(share, math.nan))
+    share = torch.where(above * below < 0, above / (above - below), math.nan)
     return start + share[..., None] * (end - start)

@@ -10,20 +10,21 @@ from dataclasses import replace
 
 import torch
 
-from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
-from gsparc.models.image_sources.clutter.residual import Residual
+from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, visible_share
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.scene import BETAS, Scene, steering
+from gsparc.models.image_sources.refine import STEP
+from gsparc.models.image_sources.scene import BETAS, Scene, spherical_waves
 from gsparc.physics.mirror_planes import images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
 # Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad], log amplitudes.
-STEPS = (0.02, 0.02, 0.003, 0.03, 0.05)
+STEPS = (SOFT, SOFT, 0.003, 0.03, STEP)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
-def descend(
-    residual: Residual,
+def refine_with_clutter(
+    residual: ClutterLikelihood,
     scene: Scene,
     paths: Paths,
     steps: int,
@@ -39,7 +40,7 @@ def descend(
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
         seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes)
-        waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
+        waves = spherical_waves(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
         cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2
@@ -57,5 +58,6 @@ def descend(
         optimizer.step()
         for group in optimizer.param_groups:
             group["lr"] *= STEP_DECAY
-    clutter = Clutter(best[0], best[1], old.plane)
-    return replace(scene, planes=best[2], phase=best[3], log_amplitude=best[4], clutter=clutter)
+    boxes, patches, planes, phase, log_amplitude = best
+    clutter = Clutter(boxes, patches, old.plane)
+    return replace(scene, planes=planes, phase=phase, log_amplitude=log_amplitude, clutter=clutter)

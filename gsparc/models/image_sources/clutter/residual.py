@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.gp_likelihood import Posterior, shares, stacked
+from gsparc.models.image_sources.gp_likelihood import Posterior, stack_real_imag, variance_along_and_across
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
@@ -24,10 +24,12 @@ from gsparc.processes.worker import raise_if_cancelled
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
 BLOCK = 64  # candidates at a time
-CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
+LEAST_VARYING = 0.01  # share of a gain's variance, by the same factor up to two fifths
+CONSTANTS = tuple(1 - LEAST_VARYING * TRIED**number for number in range(9, -1, -1))  # candidates
+NEGLIGIBLE = 1e-2  # squared size of a whitened change that the constant parts take up almost wholly
 
 
-class Residual:
+class ClutterLikelihood:
     """Rows of one output against a scene with phases; n rows are 2 n real numbers.
 
     Args:
@@ -40,8 +42,8 @@ class Residual:
 
     def __init__(self, rows: Rows, scene: Scene) -> None:
         self.rows, self.noise_floor = rows, scene.noise_floor
-        self.target = stacked(rows.target)[0][:, 0]
-        self.waves = scene.unobstructed(rows)
+        self.target = stack_real_imag(rows.target)[0][:, 0]
+        self.waves = scene.unobstructed_waves(rows)
         self._cached = self._parts(scene)
         self.scene = self._tuned(scene)
         constant = float(self.scene.visibility.constant)
@@ -56,12 +58,12 @@ class Residual:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
         varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
-        across = stacked(scaled)[1]
-        return varying.summed.matrix, shares(scene.quadrature)[1] * (across @ across.T)
+        across = stack_real_imag(scaled)[1]
+        return varying.summed.matrix, variance_along_and_across(scene.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
-        columns = stacked(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
+        columns = stack_real_imag(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
         kernel, noise = scene.visibility, scene.log_noise
         # The nearest on the grid, from which steps go either way.
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
@@ -141,7 +143,7 @@ class CandidateScorer:
         """Diagonal of K^-1 (n,), mean of both parts."""
         return self.root.square().sum(0).view(2, -1).mean(0)
 
-    def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
+    def gain_of_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
         """Return the log likelihood (m,) [nats] that m candidates gain by adding waves times their shares.
 
         Args:
@@ -154,27 +156,27 @@ class CandidateScorer:
             raise_if_cancelled()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
-            scores.append(self.score_positive(torch.complex(*change))[0])
+            scores.append(self.gain_of_positive_multiples(torch.complex(*change))[0])
         return torch.cat(scores)
 
-    def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
+    def gain_of_positive_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain, and these."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
-        # A change that the constant parts take up almost wholly has no size of its own.
-        multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
+        # A negligible change has no size of its own.
+        multiple = torch.where(power > NEGLIGIBLE, matched / power.clamp_min(NEGLIGIBLE), 0.0)
         return multiple * matched / 2, multiple
 
-    def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
+    def gain_of_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
         """Return nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
-        parts = [self.root @ part for part in stacked(waves)]
+        parts = [self.root @ part for part in stack_real_imag(waves)]
         seen = [self.projection @ part for part in parts]
         dot = [
             [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
         ]
         along, across = (self.residual @ part for part in parts)
-        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(1e-9)
+        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(NEGLIGIBLE**2)
         gain = torch.complex(
             (dot[1][1] * along - dot[0][1] * across) / determinant,
             (dot[0][0] * across - dot[0][1] * along) / determinant,
@@ -183,7 +185,7 @@ class CandidateScorer:
 
 
 @dataclass(frozen=True)
-class Unexplained:
+class UnexplainedRows:
     """What a scene leaves of its rows, and where there may be obstacles that explain it.
 
     Attributes:

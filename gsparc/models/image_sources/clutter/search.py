@@ -10,14 +10,15 @@ from functools import partial
 
 import torch
 
-from gsparc.models.image_sources.backprojection import pick_apart
-from gsparc.models.image_sources.clutter.blocking import Clutter, visible_share
-from gsparc.models.image_sources.clutter.boxes import clipped_to, find_box
-from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch
-from gsparc.models.image_sources.clutter.refine import descend
-from gsparc.models.image_sources.clutter.residual import Residual, Unexplained
+from gsparc.models.image_sources.backprojection import select_separated
+from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, Clutter, visible_share
+from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_box
+from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
+from gsparc.models.image_sources.clutter.refine import refine_with_clutter
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.gp_likelihood import Posterior
-from gsparc.models.image_sources.refine import refine
+from gsparc.models.image_sources.refine import refine_scene
+from gsparc.models.image_sources.reflection_orders import ORDER
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import Reflections
@@ -26,14 +27,13 @@ from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_canc
 
 log = logging.getLogger(__name__)
 
-BOX, PATCH, MIRROR, SEQUENCE = 6, 4, 5, 1  # parameters of each; a mirror is a patch on a new plane
+MIRROR, SEQUENCE = PATCH + 1, 1  # parameters: of a patch and its plane's offset, of an amplitude
 INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
 EPOCHS = 6  # rounds of everything
 STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
 PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
 MIN_GAIN = 12.0  # least [nats] of a candidate, predicted
 BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
-ORDER = 3  # largest of the reflections tried
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 
 
@@ -68,21 +68,21 @@ class _ClutterSearcher:
     # ---- state ----
     def _refactor(self, scene: Scene) -> None:
         """Factor the residual's covariance at a scene."""
-        self.residual = Residual(self.rows, scene)
+        self.residual = ClutterLikelihood(self.rows, scene)
         self._set_scene(self.residual.scene)
 
     def _set_scene(self, scene: Scene) -> None:
         """Set the scene, with the varying part still that of the residual."""
         self.scene, self.paths = scene, scene.unfolding.paths(self.rows.position)
-        self.waves = scene.unobstructed(self.rows)
+        self.waves = scene.unobstructed_waves(self.rows)
         self.visible = visible_share(self.paths, scene.clutter, scene.planes)
         self.residual.waves = self.waves
         self.nll = self.residual.nll(self.visible, scene.log_amplitude).item()
 
-    def _left(self) -> Unexplained:
+    def _left(self) -> UnexplainedRows:
         scorer = self.residual.scorer(self.visible, self.scene.log_amplitude)
         waves = self.waves * self.visible.T
-        return Unexplained(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
+        return UnexplainedRows(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
     def _try(self, scene: Scene, parameters: int, exact: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
@@ -111,8 +111,8 @@ class _ClutterSearcher:
         return False
 
     def _descend(self, steps: int) -> None:
-        scene = descend(self.residual, self.scene, self.paths, steps)
-        boxes = clipped_to(scene.clutter.boxes, self.room)
+        scene = refine_with_clutter(self.residual, self.scene, self.paths, steps)
+        boxes = clip_boxes(scene.clutter.boxes, self.room)
         self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
     # ---- the loop ----
@@ -149,15 +149,15 @@ class _ClutterSearcher:
         self._descend(10)
         self._drop()
         self._refactor(self.scene)
-        self._refactor(refine(self.rows, self.scene, STEPS))
+        self._refactor(refine_scene(self.rows, self.scene, STEPS))
 
     def _mirrors(self) -> None:
         """Try small mirrors, each with its best sequences."""
         added: list[SmallMirror] = []
-        for mirror in find_mirrors(self._left(), 2 * MIRRORS):
+        for mirror in find_small_mirrors(self._left(), 2 * MIRRORS):
             if len(added) == MIRRORS or mirror.score < MIN_GAIN:
                 break
-            double = any(mirror.same(other, self.wavelength) for other in added)
+            double = any(mirror.overlaps(other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
@@ -175,11 +175,13 @@ class _ClutterSearcher:
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        new = scene.over(sequences)
+        new = scene.with_other_sequences(sequences)
         paths = new.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
-        scores, gains = scorer.score_waves(new.unobstructed(self.rows) * seen.T)
-        chosen = pick_apart(new.sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources)
+        scores, gains = scorer.gain_of_waves(new.unobstructed_waves(self.rows) * seen.T)
+        chosen = select_separated(
+            new.sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources
+        )
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
@@ -212,10 +214,12 @@ class _ClutterSearcher:
 
     def _sequences(self) -> None:
         """Try more sequences over the present planes."""
-        scene, sequences = self.scene, self.scene.longer(ORDER)
+        scene, sequences = self.scene, self.scene.longer_sequences(ORDER)
         if not sequences:
             return
-        scores, _ = self._left().scorer.score_waves(scene.over(sequences).unobstructed(self.rows))
+        scores, _ = self._left().scorer.gain_of_waves(
+            scene.with_other_sequences(sequences).unobstructed_waves(self.rows)
+        )
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 

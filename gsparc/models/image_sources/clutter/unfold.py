@@ -13,10 +13,10 @@ from itertools import pairwise, permutations
 import torch
 from torch import Tensor
 
-from gsparc.physics.mirror_planes import Reflections, images, reflect
+from gsparc.physics.mirror_planes import Reflections, images, normal_form, reflect
 
 SAME_M = 0.05  # [m], sequences of the same planes whose images are closer are the same source
-EDGE = 1e-6  # tolerance of the intersection of a leg with a plane
+EDGE = 1e-6  # tolerance of the intersection of a leg with a plane, and [m] least side of a leg's box
 PARALLEL = 1e-9  # [m], difference of heights over a plane that legs along it are given
 
 
@@ -79,15 +79,15 @@ class Unfolding:
                 self.present[k, m] = True
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
-        chain = [transmitter.expand(*self.present.shape, 3)]
+        chain = [transmitter.expand(*self.present.shape, -1)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
-        length = torch.linalg.vector_norm(used[..., :3], dim=-1, keepdim=True)
-        self.normal = (used[..., :3] / length).float() * exists[..., None]
-        self.offset, self.chain = used[..., 3].float() * exists, torch.stack(chain).float()
+        normal, offset = normal_form(used)
+        self.normal, self.chain = normal.float() * exists[..., None], torch.stack(chain).float()
+        self.offset = offset[..., 0].float() * exists
         height = (self.chain[1:] * self.normal).sum(-1) - self.offset
         self.height = torch.where(exists, height, -1.0)
-        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).permute(1, 2, 3, 0)
+        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).movedim(0, -1)
 
     def paths(self, places: Tensor) -> Paths:
         """Return the paths from places (n, 3) [m]."""
@@ -111,7 +111,9 @@ def _pick(values: Tensor, chosen: Tensor) -> Tensor:
     """(K, M, n, ...) at variant `chosen` (K, n)."""
     if values.shape[1] == 1:
         return values[:, 0]
-    index = chosen[:, None].reshape(len(chosen), 1, -1, *[1] * (values.dim() - 3))
+    index = chosen[:, None]
+    while index.dim() < values.dim():
+        index = index[..., None]
     return values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
 
 

@@ -14,15 +14,15 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
-from gsparc.models.image_sources.clutter.blocking import Clutter, tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
-from gsparc.physics.mirror_planes import Reflections, all_sequences, images
+from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images, normal_form
 from gsparc.processes.trend import Walls
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
 MOST_SEQUENCES = 3_000  # sequences of walls of each length that are looked at, over the largest of them
 LOOKED_FROM = 100  # places
-SEQUENCES_AT_ONCE, SEEN_AT_ONCE = 400, 50
+AT_ONCE = 50  # sequences whose paths are held together: memory
 SHORTLIST = 4  # times as many as are wanted, before what walls hide is looked at
 SEEN = 1e-3  # mean share of an image that is kept
 HIDES = 0.01  # share of one image that a rectangle takes, to be kept
@@ -58,28 +58,28 @@ class Mirrors:
         """
         faces = [face - origin for face in walls.faces]
         grouped = _by_plane(faces)
-        planes = torch.from_numpy(np.array([plane for plane, _ in grouped]).reshape(-1, 4))
+        planes = torch.cat([NO_PLANES, *(torch.from_numpy(plane)[None] for plane, _ in grouped)])
         patches: list[Tensor] = []
         indices: list[int] = []
         for number, (_, members) in enumerate(grouped):
-            along = tangents(planes[number]).double()
+            along = plane_tangents(planes[number]).double()
             for part in _touching(members):
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
                 indices.append(number)
-        rectangles = torch.stack(patches) if patches else torch.zeros(0, 4, dtype=torch.float64)
-        size = (rectangles[:, 2:] - rectangles[:, :2]).prod(1)
+        rectangles = torch.stack(patches) if patches else torch.zeros(0, PATCH).double()
+        size = _sides(rectangles).prod(1)
         top = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
-        boxes = torch.from_numpy((walls.boxes - origin).reshape(-1, 6)).float()
+        boxes = torch.from_numpy(walls.boxes - origin).flatten(1).float()
         plane = tuple(indices[i] for i in top)
         return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
 
-    def mirroring(self, smallest: float) -> list[int]:
+    def large_planes(self, smallest: float) -> list[int]:
         """Return numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
 
         Others only block.
         """
-        sides = self.clutter.patches[:, 2:] - self.clutter.patches[:, :2]
+        sides = _sides(self.clutter.patches)
         size: dict[int, float] = {}
         for plane, (one, other) in zip(self.clutter.plane, sides.tolist(), strict=True):
             if min(one, other) >= smallest:
@@ -107,28 +107,30 @@ class Mirrors:
         candidates = [
             sequence
             for length in range(1, order + 1)
-            for sequence in all_sequences(indices[: affordable(len(indices), length)], length)
+            for sequence in all_sequences(indices[: most_mirrors(len(indices), length)], length)
             if len(sequence) == length
         ]
         sequences = _distinct(candidates, transmitter, self.planes)
         if not sequences or most < 2:
             return ((),)
 
-        def each(said: Callable[..., Tensor], numbers: Tensor, at_once: int) -> Tensor:
-            """What is said of some sequences, so many at once."""
-            parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(at_once))
+        def each(said: Callable[..., Tensor], numbers: Tensor) -> Tensor:
+            """What is said of some sequences."""
+            parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(AT_ONCE))
             return torch.cat([said(part, transmitter, places, hidden) for part in parts])
 
-        scores = each(self._power, torch.arange(len(sequences)), SEQUENCES_AT_ONCE)
+        scores = each(self._power, torch.arange(len(sequences)))
         best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
         best = best[scores[best] > 0]
         if hidden and len(best):
-            seen = each(self._share, best, SEEN_AT_ONCE)
+            seen = each(self._share, best)
             best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
             best = best[power.argsort(descending=True)]
         return ((), *(sequences[i] for i in best[: most - 1].tolist()))
 
-    def hiding(self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor) -> Clutter:
+    def obstacles_of(
+        self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor
+    ) -> Clutter:
         """Return the rectangles that mirror sequences or that hide one from a place, and the boxes."""
         clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
         used = {index for sequence in sequences for index in sequence}
@@ -159,7 +161,7 @@ class Mirrors:
         for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):
             here = paths.plane == plane
             if bool(here.any()):
-                met = paths.end[here] @ tangents(self.planes[plane]).T
+                met = paths.end[here] @ plane_tangents(self.planes[plane]).T
                 inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
         return (inside.all(-1) & paths.valid).float()
 
@@ -168,19 +170,22 @@ class Mirrors:
         return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
 
 
-def counted(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
+def walls_of_file(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
-    axes = torch.stack([torch.cat([plane[None, :3], tangents(plane).double()]) for plane in planes])
-    corners = torch.cat([planes[:, 3:], patches[:, :2]], 1)
-    return Walls(
-        axes,
-        corners,
-        patches[:, 2:] - patches[:, :2],
-        torch.from_numpy(np.zeros(0) if still is None else still).double(),
-    )
+    normal, offset = normal_form(planes)
+    axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
+    corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
+    end = torch.from_numpy(np.zeros(0) if still is None else still).double()
+    return Walls(axes, corners, _sides(patches), end)
+
+
+def _sides(patches: Tensor) -> Tensor:
+    """Lengths (Q, 2) [m] of patches (Q, 4)."""
+    low, high = patches.chunk(2, 1)
+    return high - low
 
 
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
@@ -189,9 +194,9 @@ def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray
     for face in sorted(faces, key=area, reverse=True):
         normal = normal_of(face)
         normal = normal / np.linalg.norm(normal)
-        for plane, members in planes:
-            apart = np.abs(face @ plane[:3] - plane[3]).max()
-            if abs(float(normal @ plane[:3])) > PARALLEL and apart < SAME_PLANE_M:
+        for (*other, offset), members in planes:
+            apart = np.abs(face @ other - offset).max()
+            if abs(float(normal @ other)) > PARALLEL and apart < SAME_PLANE_M:
                 members.append(face)
                 break
         else:
@@ -209,7 +214,7 @@ def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     return [corners[group[face] == number] for number in range(count)]
 
 
-def affordable(mirrors: int, length: int) -> int:
+def most_mirrors(mirrors: int, length: int) -> int:
     """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
@@ -233,7 +238,7 @@ def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor)
     return [sequences[i] for i in sorted(distinct)]
 
 
-def start_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
+def initial_log_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
     """Log amplitudes (K,) float32 to start from, given the direct wave's amplitude."""
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
-    return math.log(max(direct, 1e-6)) + order * math.log(REFLECTED)
+    return math.log(direct) + order * math.log(REFLECTED)

@@ -12,15 +12,21 @@ from torch import Tensor
 
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
-from gsparc.models.image_sources.ensemble import Look, Member, compact, left_out_error
-from gsparc.models.image_sources.gp_likelihood import with_phases
-from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, affordable, start_amplitudes
+from gsparc.models.image_sources.clutter.search import INITIAL_KERNEL
+from gsparc.models.image_sources.ensemble import Look, Member, is_compact_array, left_out_nmse
+from gsparc.models.image_sources.gp_likelihood import estimate_phases
+from gsparc.models.image_sources.known.images import (
+    MOST_PATCHES,
+    Mirrors,
+    initial_log_amplitudes,
+    most_mirrors,
+)
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.refine import learn_visibility, refine
+from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
-from gsparc.physics.mirror_planes import Reflections
+from gsparc.physics.mirror_planes import Reflections, normal_form
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
@@ -30,8 +36,7 @@ log = logging.getLogger(__name__)
 LEAST_SIDE = 2.0  # wavelengths; smaller rectangles hide, but mirror nothing
 MOVED_M, TURNED = 0.02, 0.01  # standard deviations of walls about those of the file [m], [rad]
 LOG_AMPLITUDE_STD = 0.1  # about a factor per reflection
-KERNEL, QUADRATURE = KernelVisibility(0.95, 0.6, 1.5), 0.1  # where walls say who sees what
-STEPS = (10, 80)  # of descent on the visibility kernel, then on planes, amplitudes and phases
+KERNEL, QUADRATURE = replace(INITIAL_KERNEL, constant=0.95), 0.1  # where walls say who sees what
 
 
 class KnownWallsGP(ImageSourceGP):
@@ -65,16 +70,17 @@ class KnownWallsGP(ImageSourceGP):
         rows = row_sets[0]
         given = self._scene(rows, settings)
 
-        def cost(values: list[Tensor]) -> Tensor:
-            near = walls_cost(given.planes, given.sequences, values[1], values[2])
-            return near + prior.cost(values[4], given.sequences)
+        def cost(moved: Scene) -> Tensor:
+            assert moved.phase is not None
+            near = walls_prior_cost(given.planes, given.sequences, moved.planes, moved.log_amplitude)
+            return near + prior.cost(moved.phase, given.sequences)
 
         with late_when(budget.over):
-            scene = with_phases(rows, given, QUADRATURE, self.noise_floor)
-            scene = learn_visibility(rows, scene, STEPS[0], self.kernel)
+            scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
+            scene = learn_visibility(rows, scene, self.kernel)
             prior = ReflectionPhasePrior.of(scene)
-            scene = refine(rows, scene, STEPS[1], cost)
-        error = left_out_error(rows, scene)
+            scene = refine_scene(rows, scene, settings.final_steps, cost)
+        error = left_out_nmse(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
             len(scene.sequences), len(scene.planes), error,
@@ -90,18 +96,18 @@ class KnownWallsGP(ImageSourceGP):
             log.info(
                 "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
             )
-        indices = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
+        indices = mirrors.large_planes(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
         order = settings.order
-        if order > 1 and affordable(len(indices), order) < len(indices):
-            few = affordable(len(indices), order)
+        if order > 1 and most_mirrors(len(indices), order) < len(indices):
+            few = most_mirrors(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
-        hidden = settings.clutter and compact(rows)
+        hidden = settings.clutter and is_compact_array(rows)
         ends = transmitter, rows.position
         sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
-        obstacles = mirrors.hiding(sequences, *ends) if hidden else Clutter.none()
+        obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.none()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
-            transmitter, mirrors.planes, sequences, start_amplitudes(sequences, direct),
+            transmitter, mirrors.planes, sequences, initial_log_amplitudes(sequences, direct),
             math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
@@ -151,13 +157,13 @@ class ReflectionPhasePrior:
         return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
 
 
-def walls_cost(
+def walls_prior_cost(
     known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
 ) -> Tensor:
     """Return the negative log prior [nats]: planes (P, 4) about those known, amplitudes (K,) about a law."""
-    normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
-    moved = (planes[:, 3] - known[:, 3]).square().sum() / MOVED_M**2
-    turned = (normal - known[:, :3]).square().sum() / TURNED**2
+    (normal, offset), (given_normal, given_offset) = map(normal_form, (planes, known))
+    moved = (offset - given_offset).square().sum() / MOVED_M**2
+    turned = (normal - given_normal).square().sum() / TURNED**2
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     law = torch.stack([torch.ones_like(order), order], 1)
     left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)

@@ -11,7 +11,7 @@ from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.known import images as known
-from gsparc.models.image_sources.known.images import Mirrors, affordable, start_amplitudes
+from gsparc.models.image_sources.known.images import Mirrors, initial_log_amplitudes, most_mirrors
 from gsparc.physics.mirror_planes import images
 
 ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)
@@ -21,7 +21,7 @@ def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = 
     told, _, _ = shoebox(80, pillar=True, max_order=order)
     mirrors = Mirrors.of(walls, np.zeros(3))
     transmitter, places = torch.from_numpy(told.tx[0]), torch.from_numpy(told.rx)
-    indices = mirrors.mirroring(0.25)
+    indices = mirrors.large_planes(0.25)
     return told, mirrors, mirrors.visible_sequences(indices, transmitter, places, order, most, hidden)
 
 
@@ -55,20 +55,20 @@ def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
     far = torch.from_numpy(told.rx[told.rx[:, 0] > told.tx[0, 0] + 0.5])
     transmitter = torch.from_numpy(told.tx[0])
     sequences = mirrors.visible_sequences([0], transmitter, far, 2, 20, True)
-    assert sequences == ((),) and len(mirrors.hiding(sequences, transmitter, far).patches) == 1
+    assert sequences == ((),) and len(mirrors.obstacles_of(sequences, transmitter, far).patches) == 1
     assert len(mirrors.visible_sequences([0], transmitter, far, 2, 20, False)) == 2
     behind = far + torch.tensor([-100.0, 0, 0])
-    assert len(mirrors.hiding(sequences, transmitter, behind).patches) == 0
+    assert len(mirrors.obstacles_of(sequences, transmitter, behind).patches) == 0
 
 
 def test_long_sequences_are_of_the_largest_walls():
-    assert [affordable(6, length) for length in (1, 2, 3)] == [6, 6, 6]
-    assert [affordable(100, length) for length in (1, 2, 3)] == [100, 55, 15]
-    assert affordable(0, 2) == 0
+    assert [most_mirrors(6, length) for length in (1, 2, 3)] == [6, 6, 6]
+    assert [most_mirrors(100, length) for length in (1, 2, 3)] == [100, 55, 15]
+    assert most_mirrors(0, 2) == 0
 
 
 def test_amplitudes_fall_with_the_order():
-    found = start_amplitudes(((), (0,), (0, 1)), 2.0).exp()
+    found = initial_log_amplitudes(((), (0,), (0, 1)), 2.0).exp()
     assert torch.allclose(found, torch.tensor([2.0, 1.2, 0.72]))
 
 
@@ -93,7 +93,7 @@ def test_walls_of_one_plane_that_do_not_touch_are_apart():
     moved = [np.array([3, 0, 0]), np.array([5, 0.005, 0])]
     found = Mirrors.of(SceneWalls((one, one + moved[0], one[::-1] + moved[1]), NOTHING), np.zeros(3))
     assert len(found.planes) == 1 and found.clutter.plane == (0, 0, 0)
-    assert found.mirroring(0.5) == [0] and found.mirroring(1.5) == []
+    assert found.large_planes(0.5) == [0] and found.large_planes(1.5) == []
 
 
 def test_of_a_fine_mesh_the_smallest_are_left_out(monkeypatch):
