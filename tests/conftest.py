@@ -6,9 +6,9 @@ What is large is imported where it is needed: pytest-xdist starts its workers af
 from __future__ import annotations
 
 import gc
+import pickle
 import shutil
 from collections.abc import Callable
-from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +34,7 @@ def pytest_collection_finish():
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
     """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
+    from hydra.core.config_store import ConfigStore
     from hydra.core.plugins import Plugins
     from PIL import Image
     from threadpoolctl import threadpool_limits
@@ -48,16 +49,18 @@ def _short_trainings_end_at_once():
     def dot(method, data, fold, title, path):
         Image.new("L", (1, 1)).save(path)  # what loggers are given
 
-    def once(source, file):  # a third of what composing a configuration takes
+    def once(source, file):  # a third of what composing a configuration takes; copies by `pickle`: a tenth
         key = source.provider, str(file)
         if not source.path.startswith(("gsparc.", "hydra.")):  # a plugin's may change
             return read(source, file)
         if key not in known:
-            known[key] = read(source, file)
-        return deepcopy(known[key])
+            known[key] = pickle.dumps(read(source, file))
+        return pickle.loads(known[key])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
+        # Every composing copied the store of all classes, and changes none of it.
+        patch.setattr(ConfigStore, "__deepcopy__", lambda store, memo: store, raising=False)
         patch.setattr("gsparc.commands.train.draw_predictions", dot)
         patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
         yield
