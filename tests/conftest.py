@@ -8,7 +8,9 @@ from __future__ import annotations
 import gc
 import pickle
 import shutil
+import sys
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,6 +41,8 @@ def _short_trainings_end_at_once():
     from PIL import Image
     from threadpoolctl import threadpool_limits
 
+    from gsparc.data import instantiate, load
+    from gsparc.evaluation import summary
     from gsparc.prediction.timing import ClockSettings
 
     threadpool_limits(1, "blas")  # as every command has it
@@ -57,12 +61,19 @@ def _short_trainings_end_at_once():
             known[key] = pickle.dumps(read(source, file))
         return pickle.loads(known[key])
 
+    scan = cache(lambda path, group, read=instantiate.entry_points: read(group=group))
+
     with pytest.MonkeyPatch.context() as patch:
+        # Notes of all installed packages, files of all datasets and what git says, once.
+        patch.setattr(instantiate, "entry_points", lambda group: scan(tuple(sys.path), group))
+        for module, name in ((load, "_choices"), (summary, "_git"), (summary, "_versions")):
+            patch.setattr(module, name, cache(getattr(module, name)))
         patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
         # Every composing copied the store of all classes, and changes none of it.
         patch.setattr(ConfigStore, "__deepcopy__", lambda store, memo: store, raising=False)
         patch.setattr("gsparc.commands.train.draw_predictions", dot)
         patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
+        patch.setattr("gsparc.prediction.timing.COPY_BYTES", 2**12)
         yield
 
 
