@@ -179,6 +179,15 @@ def _is_app(name: str) -> bool:
     return (name + ".").startswith("gsparc.apps.")
 
 
+def test_importing_the_operators_builds_and_loads_no_cuda():
+    """What is imported at the top of files, from that of the package on."""
+    files, met = {module_of(file): file for room, file in FILES if room == "ops"}, ["ops"]
+    for module in met:
+        names = [name.removeprefix("gsparc.") for name in imported(_top(_tree(files[module])))]
+        met += [name for name in dict.fromkeys(names) if name in files and name not in met]
+    assert len(met) > 9 and not [name for name in met if name.startswith("ops.cuda")]
+
+
 def test_few_modules_lie_beside_the_rooms():
     assert {file.name for file in (ROOT / "gsparc").glob("*.py")} == {"__init__.py", "__main__.py"}
 
