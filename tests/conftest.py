@@ -6,12 +6,8 @@ What is large is imported where it is needed: pytest-xdist starts its workers af
 from __future__ import annotations
 
 import gc
-import pickle
 import shutil
-import sys
 from collections.abc import Callable
-from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,51 +25,19 @@ def pytest_collection():
 
 def pytest_collection_finish():
     gc.freeze()
-    gc.set_threshold(5_000, 10, 10)
+    gc.set_threshold(50_000, 10, 10)
     gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
-    """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
-    from hydra.core.config_store import ConfigStore
-    from hydra.core.plugins import Plugins
-    from PIL import Image
+    import quick
     from threadpoolctl import threadpool_limits
 
-    from gsparc.data import instantiate, load
-    from gsparc.evaluation import summary
-    from gsparc.prediction.timing import ClockSettings
-
     threadpool_limits(1, "blas")  # as every command has it
-    Plugins.instance()  # which imports the class anew
-    found = import_module("hydra._internal.core_plugins.importlib_resources_config_source")
-    read, known = found.ImportlibResourcesConfigSource._read_config, {}
-
-    def dot(method, data, fold, title, path):
-        Image.new("L", (1, 1)).save(path)  # what loggers are given
-
-    def once(source, file):  # a third of what composing a configuration takes; copies by `pickle`: a tenth
-        key = source.provider, str(file)
-        if not source.path.startswith(("gsparc.", "hydra.")):  # a plugin's may change
-            return read(source, file)
-        if key not in known:
-            known[key] = pickle.dumps(read(source, file))
-        return pickle.loads(known[key])
-
-    scan = cache(lambda path, group, read=instantiate.entry_points: read(group=group))
-
     with pytest.MonkeyPatch.context() as patch:
-        # Notes of all installed packages, files of all datasets and what git says, once.
-        patch.setattr(instantiate, "entry_points", lambda group: scan(tuple(sys.path), group))
-        for module, name in ((load, "_choices"), (summary, "_git"), (summary, "_versions")):
-            patch.setattr(module, name, cache(getattr(module, name)))
-        patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
-        # Every composing copied the store of all classes, and changes none of it.
-        patch.setattr(ConfigStore, "__deepcopy__", lambda store, memo: store, raising=False)
-        patch.setattr("gsparc.commands.train.draw_predictions", dot)
-        patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
-        patch.setattr("gsparc.prediction.timing.COPY_BYTES", 2**12)
+        for one in (quick.compose_once, quick.look_once, quick.time_and_draw_less):
+            one(patch)
         yield
 
 
