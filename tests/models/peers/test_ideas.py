@@ -57,8 +57,6 @@ def test_gsrf_lets_opposite_phases_cancel(tmp_path):
     ("name", "settings", "share"),
     [
         ("gsrf", {"count": 60, "max_steps": 150, "rate": 8e-3}, 0.75),
-        ("swiftwrf", {"count": 60, "max_steps": 200, "rate": 5e-3, "octaves": 2}, 0.5),
-        ("wrfgs", {"count": 60, "max_steps": 200, "octaves": 2}, 0.75),
         pytest.param(
             "nerf2",
             {
