@@ -8,8 +8,6 @@ from __future__ import annotations
 import gc
 import shutil
 from collections.abc import Callable
-from copy import deepcopy
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,39 +25,19 @@ def pytest_collection():
 
 def pytest_collection_finish():
     gc.freeze()
-    gc.set_threshold(5_000, 10, 10)
+    gc.set_threshold(50_000, 10, 10)
     gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
-    """Pictures, sixty rounds of timed queries and YAML read again were half of a training of a second."""
-    from hydra.core.plugins import Plugins
-    from PIL import Image
+    import quick
     from threadpoolctl import threadpool_limits
 
-    from gsparc.prediction.timing import ClockSettings
-
     threadpool_limits(1, "blas")  # as every command has it
-    Plugins.instance()  # which imports the class anew
-    found = import_module("hydra._internal.core_plugins.importlib_resources_config_source")
-    read, known = found.ImportlibResourcesConfigSource._read_config, {}
-
-    def dot(method, data, fold, title, path):
-        Image.new("L", (1, 1)).save(path)  # what loggers are given
-
-    def once(source, file):  # a third of what composing a configuration takes
-        key = source.provider, str(file)
-        if not source.path.startswith(("gsparc.", "hydra.")):  # a plugin's may change
-            return read(source, file)
-        if key not in known:
-            known[key] = read(source, file)
-        return deepcopy(known[key])
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(found.ImportlibResourcesConfigSource, "_read_config", once)
-        patch.setattr("gsparc.commands.train.draw_predictions", dot)
-        patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
+        for one in (quick.compose_once, quick.look_once, quick.time_and_draw_less):
+            one(patch)
         yield
 
 

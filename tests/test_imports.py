@@ -58,8 +58,13 @@ FILES = [
 ]
 
 
-def imported(tree: ast.AST):
-    for node in ast.walk(tree):
+def imported(tree: ast.Module):
+    """Modules and names, also those within functions; of expressions, nine tenths, nothing is asked."""
+    todo: list[ast.AST] = [tree]
+    for node in todo:
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inner = getattr(node, part, None)
+            todo += inner if isinstance(inner, list) else []
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -68,26 +73,21 @@ def imported(tree: ast.AST):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def named(tree: ast.AST):
+def named(text: str):
     """Modules and classes in strings: of `import_module`, `_target_`, registries and tables of lazy names."""
-    nodes = list(ast.walk(tree))
-    bodies = [node.body[0] for node in nodes if getattr(node, "body", None) and isinstance(node.body, list)]
-    docs = {id(first.value) for first in bodies if isinstance(first, ast.Expr)}
-    for node in nodes:
-        text = node.value if isinstance(node, ast.Constant) and id(node) not in docs else None
-        found = isinstance(text, str) and re.fullmatch(r"(?:pkg://)?(gsparc(?:\.\w+)+)", text)
-        if found and text not in GROUPS:
-            yield found[1]
+    found = re.findall(r"""["'](?:pkg://)?(gsparc(?:\.\w+)+)["']""", text)
+    yield from (name for name in found if name not in GROUPS)
 
 
-def needed(tree: ast.Module):
+def needed(file: Path):
     """What is imported or named, but for types alone."""
-    typed = [
-        node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    ]
-    kept = ast.Module([node for node in tree.body if node not in typed], [])
-    yield from imported(kept)
-    yield from named(kept)
+    body = [node for node in _tree(file).body if not _of_types(node)]
+    yield from imported(ast.Module(body, []))
+    yield from named(_text(file))
+
+
+def _of_types(node: ast.stmt) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
 
 
 def room_of(name: str) -> str | None:
@@ -126,7 +126,7 @@ def test_rooms_import_what_the_list_allows_and_nothing_else(capsys):
     back = [pair for pair in found if levels[pair[0]] <= levels[pair[1]]]
     lines = Counter({room: 0 for room in ROOMS})
     for room, file in FILES:
-        lines[room] += len(file.read_text(encoding="utf-8").splitlines())
+        lines[room] += len(_text(file).splitlines())
     with capsys.disabled():
         table = [f"{'room':<12}{'floor':>6}{'lines':>7}  imports"]
         for room in sorted(ROOMS, key=lambda r: (-levels[r], r)):
@@ -142,7 +142,7 @@ def test_no_file_needs_itself(room):
     files = {module_of(file): file for one, file in FILES if one == room}
     used = {}
     for module, file in files.items():
-        found = {_of(name, files) for name in needed(_tree(file))}
+        found = {_of(name, files) for name in needed(file)}
         used[module] = found - {module, None}
     assert len(list(TopologicalSorter(used).static_order())) >= len([one for one in used if used[one]])
 
@@ -159,10 +159,8 @@ def _of(name: str, files: dict[str, Path]) -> str | None:
 
 
 def test_strings_are_followed():
-    tree = ast.parse(
-        'import_module("gsparc.apps.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
-    )
-    assert list(named(tree)) == ["gsparc.apps.maps.making", "gsparc.models.baselines.zero.Zero"]
+    text = 'import_module("gsparc.apps.maps.making"); METHODS = {"zero": "gsparc.models.baselines.zero.Zero"}'
+    assert list(named(text)) == ["gsparc.apps.maps.making", "gsparc.models.baselines.zero.Zero"]
     assert ("evaluation", "conf") in arrows(), "the configuration is named in a string alone"
 
 
@@ -179,6 +177,15 @@ def test_the_core_does_without_the_apps():
 
 def _is_app(name: str) -> bool:
     return (name + ".").startswith("gsparc.apps.")
+
+
+def test_importing_the_operators_builds_and_loads_no_cuda():
+    """What is imported at the top of files, from that of the package on."""
+    files, met = {module_of(file): file for room, file in FILES if room == "ops"}, ["ops"]
+    for module in met:
+        names = [name.removeprefix("gsparc.") for name in imported(_top(_tree(files[module])))]
+        met += [name for name in dict.fromkeys(names) if name in files and name not in met]
+    assert len(met) > 9 and not [name for name in met if name.startswith("ops.cuda")]
 
 
 def test_few_modules_lie_beside_the_rooms():
@@ -205,12 +212,17 @@ def _imports(file: Path) -> tuple[str, ...]:
 
 @cache
 def _needs(file: Path) -> frozenset[str]:
-    return frozenset((*_imports(file), *named(_tree(file))))
+    return frozenset((*_imports(file), *named(_text(file))))
+
+
+@cache
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8")
 
 
 @cache
 def _tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"))
+    return ast.parse(_text(file))
 
 
 def _top(tree: ast.Module) -> ast.Module:
@@ -231,8 +243,8 @@ def test_imports_have_full_names():
 def test_nothing_prints_and_nothing_happens_at_import():
     for file in (*(file for _, file in FILES), ROOT / "train.py"):
         tree = _tree(file)
-        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
-        printed = [c.lineno for c in calls if c.func.id == "print"]
+        asked = ast.walk(tree) if "print(" in _text(file) else ()
+        printed = [n.lineno for n in asked if isinstance(n, ast.Call) and ast.unparse(n.func) == "print"]
         assert not printed, f"{file}:{printed}: print: use logging or rich"
         for node in tree.body:  # os.environ, torch.set_num_threads, ... belong into functions
             if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):

@@ -120,14 +120,6 @@ def test_settings_of_the_schedule_may_change_and_are_named(spectra_file, halfway
     assert re.search(r"which had trainer\.max_steps=\d+ \(here 25\)", caplog.text)
 
 
-def test_checkpoints_come_when_asked_for_and_go_on_bit_identically(spectra_file, halfway, tmp_path):
-    last = halfway.checkpoints[0].with_name("last.ckpt")
-    assert checkpoint.read(last).extra["trainer"]["global_step"] == 20  # the last step leaves one, too
-    _, objects = train(short(spectra_file, f"ckpt_path='{last}'"), tmp_path)
-    whole, resumed = weights(halfway.checkpoints[0]), weights(objects.checkpoints[0])
-    assert whole.keys() == resumed.keys() and all(torch.equal(whole[k], resumed[k]) for k in whole)
-
-
 def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway, tmp_path):
     """Another campaign's box, and with it the origin of local coordinates, is never quite the same."""
     new = spectra(tmp_path / "new.npz", rows=55)

@@ -28,19 +28,20 @@ ENDS = {"TSAN_OPTIONS": "exitcode=66:halt_on_error=1", "ASAN_OPTIONS": "detect_l
 SMALL = SphereGrid.full_sphere(8, 24)
 
 RACE = """
+#include <cstdlib>
 #include "cuda/device.h"
 using namespace gsparc::device;
-void kernel(int* out, int way) {
+void kernel(int* out, int way, int reach) {
     __shared__ int left[64];
     left[threadIdx.x] = threadIdx.x;
     if (way == 1) warp_sync();
     if (way == 2) block_sync();
     if (way == 3) warp_any(true);
-    out[threadIdx.x] = left[threadIdx.x ^ REACH];
+    out[threadIdx.x] = left[threadIdx.x ^ reach];
 }
 int main(int, char** arguments) {
     int out[64];
-    return launch(kernel, 2, 1, 64, nullptr, out, *arguments[1] - '0');
+    return launch(kernel, 2, 1, 64, nullptr, out, *arguments[1] - '0', std::atoi(arguments[2]));
 }
 """
 NOTHING, WARP, BLOCK, SHUFFLE = "0123"
@@ -144,16 +145,16 @@ def test_watched_kernels_have_nothing_to_report(watch, record):
     assert int(done.stdout.split()[0]) > 60
 
 
-@pytest.mark.parametrize("reach,enough", [(1, {WARP, BLOCK}), (32, {BLOCK})], ids=["warp", "block"])
-def test_shared_memory_without_a_barrier_is_reported(tmp_path, reach, enough):
+def test_shared_memory_without_a_barrier_is_reported(tmp_path):
     """Neighbours in a warp need its barrier, warps that of the block; a shuffle is not one."""
     source = tmp_path / "race.cpp"
-    source.write_text(RACE.replace("REACH", str(reach)))
+    source.write_text(RACE)
     program = str(compiled(tmp_path / "race", THREADS, str(source)))
-    for way in (NOTHING, WARP, BLOCK, SHUFFLE):
-        done = ends(program, way)
-        told = done.returncode == 66 and "data race" in done.stderr
-        assert told != (way in enough), f"way {way}: {done.returncode} {done.stderr[:2000]}"
+    for reach, enough in (("1", {WARP, BLOCK}), ("32", {BLOCK})):
+        for way in (NOTHING, WARP, BLOCK, SHUFFLE):
+            done = ends(program, way, reach)
+            told = done.returncode == 66 and "data race" in done.stderr
+            assert told != (way in enough), (reach, way, done.returncode, done.stderr[:2000])
 
 
 def test_memory_beside_a_tensor_is_reported(tmp_path):

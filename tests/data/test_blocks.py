@@ -168,14 +168,15 @@ def test_an_array_that_was_never_written_filled_the_disk(
 
 
 def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch, refused):
-    zeros = {**arrays(), "csi": np.zeros((2**20, 40), np.complex64)}  # 320 MiB in half a megabyte
+    zeros = {**arrays(), "csi": np.zeros((2**18, 40), np.complex64)}  # 80 MiB in an eighth of a megabyte
     np.savez_compressed(tmp_path / "own.npz", **zeros)
+    monkeypatch.setattr(raw, "BIG", 2**26)
     monkeypatch.setattr(np, "load", lambda *unused, **named: pytest.fail("read before it was refused"))
-    refused("csi: shape .* no other array has .1048576,. rows", load_own, tmp_path / "own.npz")
-    zeros |= {"rx_position": np.zeros((2**20, 3))}
+    refused("csi: shape .* no other array has .262144,. rows", load_own, tmp_path / "own.npz")
+    zeros |= {"rx_position": np.zeros((2**18, 3))}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
-    monkeypatch.setattr(raw, "memory", lambda: 2**29)
-    refused("csi: .* too little memory for 360,", load_own, tmp_path / "own.npz")
+    monkeypatch.setattr(raw, "memory", lambda: 2**27)
+    refused("csi: .* too little memory for 90,", load_own, tmp_path / "own.npz")
     with zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive, archive.open("csi.npy", "w") as entry:
         head = {"descr": "<c8", "fortran_order": False, "shape": (10**15,)}
         np.lib.format.write_array_header_1_0(entry, head)

@@ -4,9 +4,9 @@ import csv
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -75,9 +75,7 @@ def test_commit_is_known_inside_the_tree_only(tmp_path):
     shutil.copy(gsparc.evaluation.summary.__file__, outside)
     # Inside another project's repository an untracked copy must not claim that project's commit.
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
-    code = f"import runpy; print(runpy.run_path({str(outside)!r})['provenance']()['git'])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "None"
+    assert runpy.run_path(str(outside))["provenance"]()["git"] is None
 
 
 def test_a_killed_run_left_a_lock_in_the_repository(tmp_path):

@@ -30,7 +30,8 @@ def test_facts_are_numbers_and_words():
     assert 10 < facts["memory/peak_mb"] < 1e6
 
 
-def test_reference_work_takes_time():
+def test_reference_work_takes_time(monkeypatch):
+    monkeypatch.setattr("gsparc.prediction.timing.COPY_BYTES", 2**24)  # as it is outside of tests
     times = interleaved({"copy": reference_copy()}, ClockSettings(rounds=5))["copy"]
     assert (times > 0.05).all()
 

@@ -130,14 +130,12 @@ def test_a_file_that_is_not_the_pinned_one_is_said_and_not_kept(mirror, monkeypa
     assert mirror.asked["/makers/data/0123abc/release/first.csv"] == 1
 
 
-def test_a_failure_that_passes_is_tried_again(mirror, monkeypatch, tmp_path):
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, cut))
-    assert (fetch("room", retries=1) / "1.bin").read_bytes() == ONE
-
-
-def test_a_redirect_is_followed(mirror, monkeypatch, tmp_path):
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, moved))
-    assert (fetch("room", retries=0) / "1.bin").read_bytes() == ONE
+@pytest.mark.parametrize(("how", "retries"), [(cut, 1), (moved, 0)])
+def test_a_failure_that_passes_is_tried_again_and_a_redirect_followed(
+    mirror, monkeypatch, tmp_path, how, retries
+):
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, how))
+    assert (fetch("room", retries=retries) / "1.bin").read_bytes() == ONE
 
 
 @pytest.mark.parametrize(

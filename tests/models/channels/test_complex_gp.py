@@ -31,6 +31,13 @@ def _fit(data, fold):
     return method, method.fit(data, fold, FitContext()).notes
 
 
+@pytest.fixture(scope="module")
+def dense():
+    """Those receivers, and what is learned of them."""
+    data, fold = _dense()
+    return data, fold, *_fit(data, fold)
+
+
 def _restored(method, site, folder):
     torch.save(method.state(), folder / "state.pt")
     again = ComplexGP()
@@ -38,9 +45,8 @@ def _restored(method, site, folder):
     return again
 
 
-def test_dense_receivers_tell_and_far_away_nothing_is_said(tmp_path):
-    data, fold = _dense()
-    method, notes = _fit(data, fold)
+def test_dense_receivers_tell_and_far_away_nothing_is_said(dense, tmp_path):
+    data, fold, method, notes = dense
     batch = data.batch(fold.test)
     prediction = method.predict(batch)
     assert nmse(prediction.mean.numpy(), batch.target.numpy()) < 0.3
@@ -55,9 +61,8 @@ def test_dense_receivers_tell_and_far_away_nothing_is_said(tmp_path):
     assert far.mean.abs().max() < 1e-3 and far.confidence.max() < 1e-3
 
 
-def test_many_rows_are_told_by_the_nearest(tmp_path, monkeypatch):
-    data, fold = _dense()
-    whole, _ = _fit(data, fold)
+def test_many_rows_are_told_by_the_nearest(dense, tmp_path, monkeypatch):
+    data, fold, whole, _ = dense
     monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
     near, notes = _fit(data, fold)
     assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"

@@ -94,7 +94,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 
 
 def test_one_field_of_all_ends_is_better_than_plain_processes():
-    data = _ceiling(ends=4, count=60, shift=(0.03, -0.02, 0.0))
+    data = _ceiling(ends=4, count=40, shift=(0.03, -0.02, 0.0))
     fold = fold_of(data)
     field, notes = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
     assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)

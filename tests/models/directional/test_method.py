@@ -55,12 +55,13 @@ def test_a_search_starts_from_sources_where_rays_meet():
     data, _, sources = directed(60)
     rows = np.arange(60)
     fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
-    found = fitted(data, fold)[0].found()
+    method = fitted(data, fold)[0]
+    found = method.found()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
         start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
         assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
-    context, init = FitContext(beside={"rays": fitted(data, fold)[0]}), InitSettings()
+    context, init = FitContext(beside={"rays": method}), InitSettings()
     assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])
     assert CANDIDATES["sources"](init, True, FitContext()).start is None
 

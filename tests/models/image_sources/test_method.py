@@ -163,7 +163,7 @@ def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
     assert draw_rows(data, fold.train, 10_000, 0).target.shape == (3 * len(fold.train), 1)
-    method, _ = fitted(data, fold, tmp_path)
+    method, _ = fitted(data, fold, tmp_path, clutter=False)
     assert _predicted(method, data, fold.test).mean.shape == (len(fold.test), 3, 1)
     assert error(method, data, fold.test) < 0.03
 
@@ -175,7 +175,7 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     mask[..., ::4] = True
     known = replace(data, mask=mask)
     assert set(draw_rows(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
-    method, _ = fitted(known, fold, tmp_path)
+    method, _ = fitted(known, fold, tmp_path, clutter=False)
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
 

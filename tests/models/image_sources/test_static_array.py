@@ -157,8 +157,8 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
 
 def test_rotated_array_and_tones(tmp_path):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    data, fold = _uplink(60, antennas=2, tones=CARRIER + 5e6 * np.arange(3), rotation=turn)
-    method, _ = fitted(data, fold, tmp_path)
+    data, fold = _uplink(50, antennas=2, tones=CARRIER + 5e6 * np.arange(2), rotation=turn)
+    method, _ = fitted(data, fold, tmp_path, clutter=False)
     assert error(method, data, fold.test) < 0.02
     rows = np.arange(len(data))[:, None, None]
     turned = replace(data, rx_rotation=np.where(rows == 3, np.eye(3), data.rx_rotation))
@@ -237,9 +237,9 @@ def test_budget_is_kept(tmp_path):
     """To a tenth and a step, however many searches are asked for."""
     data, fold = _uplink(100)
     method = ImageSourceGP(searches=6, search_rows=220, margin=8.0)
-    started = time.monotonic()
-    report = method.fit(data, fold, FitContext(tmp_path, budget_s=2.0))
-    assert time.monotonic() - started < 2.2 + 2.0 and report.seconds < 2.2 + 2.0
+    started = time.process_time()
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=0.5, budget_clock="processor"))
+    assert time.process_time() - started < 0.55 + 2.0 and report.limited_by == "processor"
 
 
 def test_an_interrupt_ends_all_searches(tmp_path, monkeypatch):

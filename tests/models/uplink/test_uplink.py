@@ -105,7 +105,7 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
         assert error[sure].median() < factor * error[~sure].median()
 
 
-@pytest.mark.parametrize("make", [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(max_steps=20)])
+@pytest.mark.parametrize("make", [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(max_steps=5)])
 def test_peers_answer_and_keep(make, tmp_path) -> None:
     data = city()
     method = make()

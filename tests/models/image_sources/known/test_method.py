@@ -27,7 +27,7 @@ def room(tmp_path_factory):
     """A room with a pillar, and the file of its walls."""
     file = tmp_path_factory.mktemp("scene") / "room.yaml"
     file.write_text(ROOM, encoding="utf-8")
-    told, data, fold = shoebox(260, pillar=True)
+    told, data, fold = shoebox(120, pillar=True)
     return told, data, fold, file
 
 
@@ -43,9 +43,9 @@ def missed(field, data, rows: np.ndarray) -> float:
 
 
 def test_known_walls_tell_all_from_few_rows(room):
-    """A search on the same 80 rows misses most of them."""
+    """A search on the same 60 rows misses most of them."""
     _, data, fold, file = room
-    known, report = fitted("scene", data, fold.train[:80], file=str(file))
+    known, report = fitted("scene", data, fold.train[:60], file=str(file))
     missed_here = missed(known, data, fold.test)
     assert missed_here < 0.05
     assert known.terms[:2] == ("phase", "visibility") and known.count > 20

@@ -52,7 +52,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_network_with_two_wrong_azimuths(tmp_path):
-    one = network(1, wrong=2, moments=300, asked=120)
+    one = network(1, wrong=2, moments=220, asked=120)
     method, report = fitted(one, 6, tmp_path)
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
     assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
@@ -71,7 +71,7 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     east, west = more.joint(around, torch.tensor([30, 31]))[0]
     assert east[0] > west[0] + 10 and east[1] == pytest.approx(float(west[1]))  # no pattern
     assert draw_sector_levels(method, one.data(6), np.arange(500), tmp_path / "sectors.png")
-    wrong = one.azimuth != network(1, moments=300, asked=120).azimuth
+    wrong = one.azimuth != network(1, moments=220, asked=120).azimuth
     named = [
         note.split("azimuth of ")[1].split(":")[0]
         for note in report.notes
@@ -86,7 +86,7 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
 
 
 def test_sites_without_azimuths_have_no_pattern(tmp_path):
-    one = network(2, moments=250, asked=100)
+    one = network(2, moments=180, asked=100)
     method, report = fitted(one, 6, tmp_path, azimuths=False)
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6, azimuths=False))
     assert found["rmse"] < 0.7 * plain["rmse"] and found["best"] > plain["best"]
