@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -72,18 +72,18 @@ def assemble(
     convergence: Convergence | None,
     seconds: float,
     shards: Shards,
+    rows: Rows,
 ) -> Assembled:
-    """Put the shards, all of them there, together, write the file, drop the shards.
+    """Write the file from what the shards hold (`together`), drop the shards.
 
-    One shard is in memory at a time; what is large is put together on disk. `seconds` [s] were spent on
-    anything but the shards, which know their own; both are the file's `simulate_s`.
+    `seconds` [s] were spent on anything but the shards, which know their own; both are the file's
+    `simulate_s`.
 
     Raises:
         ValueError: nothing reaches any receiver.
     """
     seconds += sum(float(shards.get(n, SECONDS)[SECONDS]) for n in shards.numbers())
-    whole, paths = _together(shards, len(survey))
-    engine = survey.engine
+    whole, paths, engine = rows.arrays, rows.paths, survey.engine
     power = whole["received_power"]
     reached = power > 0
     if not reached.any():
@@ -110,8 +110,18 @@ def assemble(
     return Assembled(data, power, whole["delay_spread"], facts)
 
 
-def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
-    """What the shards hold of all rows, in their order."""
+class Rows(NamedTuple):
+    """What all shards hold: arrays with a row for each of the survey's, by name, and their paths."""
+
+    arrays: dict[str, np.ndarray]
+    paths: Paths
+
+
+def together(shards: Shards, rows: int) -> Rows:
+    """Return what the shards, all of them there, hold of so many rows, in their order.
+
+    One shard is in memory at a time; what is large is put together on disk.
+    """
     counts = np.zeros(rows, dtype=np.int64)
     for number in shards.numbers():
         part = shards.get(number, ROWS, "offsets")
@@ -127,7 +137,7 @@ def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
             if name not in whole:
                 whole[name] = empty((int(length), *values.shape[1:]), values.dtype)
             whole[name][at] = values
-    return whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS))
+    return Rows(whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS)))
 
 
 def _arrays(

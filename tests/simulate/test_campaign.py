@@ -23,7 +23,7 @@ from gsparc.data.schema import LIGHT
 from gsparc.evaluation.simulated import floor_plan
 from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
-from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
+from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays, together
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import PropagationEffects
@@ -302,8 +302,8 @@ class Rays(ShoeboxEngine):
 def with_rays(monkeypatch, off: float) -> AutoSettings:
     monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
     monkeypatch.setattr(Rays, "off", off)
-    monkeypatch.setattr(deciding.Decider, "_may_pay", lambda *unused: True)
-    monkeypatch.setattr(deciding, "pays", lambda *unused: True)
+    monkeypatch.setattr(deciding, "COMPILING", 0)
+    monkeypatch.setattr(deciding, "TRIAL", 0)
     return AutoSettings(probes=64, held_back=64, full=MIRROR)
 
 
@@ -326,7 +326,8 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
 
 
 def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
-    outcome = simulate(plan(effects=with_rays(monkeypatch, 1.2)), tmp_path / "box.h5")
+    asked, many = with_rays(monkeypatch, 1.2), replace(SCENE, num_receivers=200)
+    outcome = simulate(plan(scene=many, effects=asked), tmp_path / "box.h5")
     row = outcome.choice.table[-1]
     assert outcome.choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
     assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
@@ -343,15 +344,14 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     monkeypatch.setattr(deciding.auto, "verify", refuted)
     settings = replace(FEW_PROBES, full=full)
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
-    assert outcome.effects == outcome.choice.effects == full and outcome.choice.saved is None
+    assert outcome.effects == outcome.choice.effects == full
     assert "NOT MET by less (line of sight, specular, depth" in verdict(outcome.choice)
 
 
 def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
-    """All rows are probes, or few are left."""
-    outcome = simulate(plan(effects=replace(FEW_PROBES, probes=60, held_back=60)), tmp_path / "box.h5")
-    assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
-    monkeypatch.setattr(deciding, "pays", lambda choice, rows, saved: rows > 60)
+    """By a count of rows: measured seconds let the load of a machine decide what a file holds."""
+    monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
+    monkeypatch.setattr(deciding, "COMPILING", 10)
     few = simulate(plan(effects=FEW_PROBES), tmp_path / "few.h5")
     assert few.effects.depth == 4 and few.choice.effects.depth < 4
     many = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5")
@@ -386,7 +386,7 @@ def put_together(out: Path, receivers: int) -> int:
     gc.set_threshold(700, 10, 10)  # Python's own: what is looked for seldom stays longer
     tracemalloc.start()
     try:
-        assemble(asked, survey, asked.effects, None, None, 0.0, shards)
+        assemble(asked, survey, asked.effects, None, None, 0.0, shards, together(shards, receivers))
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

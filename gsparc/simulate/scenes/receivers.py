@@ -213,10 +213,6 @@ def _of_file(
             raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
         across = georeference.from_degrees(*across.T)
     above = np.full(len(across), height) if listed.height is None else listed.height
-    if time_s is not None and len(time_s) != len(across):
-        raise ValueError(
-            f"scene.receivers.file: {how.file}, time_s: {len(time_s)} times for {len(across)} places"
-        )
     return np.column_stack([across, above]), time_s
 
 
