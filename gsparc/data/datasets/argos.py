@@ -7,7 +7,7 @@ truth. Every prediction therefore uses a fresh uplink of the same snapshot, if o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite
 from gsparc.data.own_checks import Checker
-from gsparc.data.position_encoder import EncoderSettings, encoder_for
+from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
 
@@ -31,12 +31,9 @@ TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
 FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets are rebuilt
 
-Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
 
 def load_argos(
     root: str | Path,
-    encoder: Encoder | None = None,
     *,
     antenna: int | str = 0,
     positions: str | bool = "encoder",
@@ -46,9 +43,9 @@ def load_argos(
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
-        encoder: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
-        positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
+        positions: `encoder`, those of `encode_positions` by the training rows, or `true` where the folder has
+            `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
             offsets of the snapshot; a factor of modulus 1 changes no error.
 
@@ -73,7 +70,7 @@ def load_argos(
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
-    where = _places(root, positions, encoder, uplink, split)
+    where = _places(root, positions, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -152,14 +149,14 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
+def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
         return _true_positions(root / "positions.npy", len(up))
-    if of != "encoder" or code is None:
+    if of != "encoder":
         raise DataError(f"dataset.positions={of!r}: expected encoder or true")
     # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
     rows = np.arange(len(up)) if split is None else split[0]
-    return code(up, rows)
+    return encode_positions(up, rows)
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
@@ -172,27 +169,10 @@ def _true_positions(path: Path, rows: int) -> np.ndarray:
 
 
 class Argos(Release):
-    """The Argos release or any folder in its layout.
-
-    Args:
-        root, **rest: see `Release` and `load_argos`.
-        encoder: `file` or `folder`, and `EncoderSettings`.
-    """
+    """The Argos release or any folder in its layout; settings of `load_argos` and `Release`."""
 
     called, reader = "Argos", staticmethod(load_argos)
     hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
-
-    def __init__(
-        self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
-    ) -> None:
-        settings = dict(encoder or {})
-        file, room = settings.pop("file", None), Path(settings.pop("folder", "outputs/encoders"))
-        super().__init__(root, **rest)
-        self.encoder = (room, EncoderSettings(**settings), file)
-
-    def read(self, folder: Path) -> Measurements:
-        """Read downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
-        return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
 class ArgosSim(Argos):
