@@ -87,7 +87,7 @@ def _fact_text(fact: Any) -> str:
     if isinstance(fact, np.ndarray):
         return content_hash({"": fact})
     if is_dataclass(fact):
-        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact)})
+        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact) if one.compare})
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 

@@ -42,6 +42,8 @@ class Stations:
         carrier_hz: (T,) [Hz]; None where all have the site's.
         sector: (T, 6) azimuth from north, tilt below the horizon, widths of the beam across and in height
             [deg], and power [dB], NaN where unknown; None where nothing of it is known.
+        label: (T,) what a list of cells calls them, to be shown; None where that is `name`. It is no fact of
+            the measurements.
     """
 
     position: np.ndarray
@@ -49,6 +51,7 @@ class Stations:
     rotation: np.ndarray | None = None
     carrier_hz: np.ndarray | None = None
     sector: np.ndarray | None = None
+    label: Sequence[str] | None = field(default=None, compare=False)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -58,7 +61,8 @@ class Stations:
         optional = (self.rotation, self.carrier_hz, self.sector)
         rotation, carrier, sector = (None if one is None else one[numbers] for one in optional)
         called = tuple(names or (self.name[i] for i in numbers))
-        return Stations(self.position[numbers], called, rotation, carrier, sector)
+        label = None if self.label is None else tuple(self.label[i] for i in numbers)
+        return Stations(self.position[numbers], called, rotation, carrier, sector, label)
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,13 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     assert arrays["rssi_db"].tolist() == [4, 8]
 
 
+def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
+    """A map of the same levels said dB."""
+    table = understand_table(write("x,y,z,RSRP\n1,2,3,-80\n4,5,6,-81\n"))
+    assert "column 'RSRP' taken as rssi_db [dB]" in table.notes
+    assert interpret(table.raw, "table").data.site.level_unit == "dB"
+
+
 def test_many_transmitters_did_not_become_one_without_a_word(write):
     rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
     notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes

@@ -75,9 +75,10 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
         return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
     count = len(places)
     places[lost] = np.nan
-    names = check.raw.arrays.get("station_name")
-    if names is not None and not check.fits("station_name", names, (count,)):
-        return None
+    names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))
+    for what, texts in (("station_name", names), ("station_label", label)):
+        if texts is not None and not check.fits(what, texts, (count,)):
+            return None
     called = tuple(map(str, range(count) if names is None else names))
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
@@ -92,7 +93,8 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
         wrong = np.abs(sector[:, :4]).max(initial=0, where=np.isfinite(sector[:, :4]))
         if wrong > FULL_TURN:
             return check.refuse("station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}")
-    return Stations(places, called, rotation, sector=sector)
+    shown = None if label is None else tuple(map(str, label))
+    return Stations(places, called, rotation, sector=sector, label=shown)
 
 
 def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:

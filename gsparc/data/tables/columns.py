@@ -342,8 +342,8 @@ def _note(columns: tuple[Column, ...]) -> str:
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
     unit = SCHEMA.get(KINDS[column.role], "deg")
-    # dB are levels without a reference; calling them dBm would invent one.
-    return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
+    # Levels of which nobody said more are in dB; calling them dBm would invent a reference.
+    return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
 
 
 def as_station(column: Column) -> Column:

@@ -152,6 +152,7 @@ class StationList:
         index: (S,) which station each row of another table is of; None where each has a column there.
         aliases: other names of all of them.
         repeated: names that several of them share, by the head of their column.
+        label: (T,) its own names, where `names` are others.
     """
 
     names: tuple[str, ...]
@@ -160,6 +161,7 @@ class StationList:
     index: np.ndarray | None = None
     aliases: tuple[tuple[str, ...], ...] = ()
     repeated: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    label: tuple[str, ...] | None = None
 
     def shared(self, words: np.ndarray) -> str | None:
         """Return what is wrong where words (S,) are of a column whose names several stations share."""
@@ -177,7 +179,7 @@ class StationList:
         known = set(words.tolist())
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
-        return replace(self, names=names)
+        return replace(self, names=names, label=None if names == self.names else self.names)
 
     def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
         """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
@@ -196,7 +198,8 @@ class StationList:
             for name, array in self.extra.items()
         }
         where = Places(across, height, self.places.degrees)
-        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra)
+        label = None if self.label is None else (*self.label, *lost)
+        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra, label=label)
         return grown, lost, [Caution(f"{said}: {some(lost)}; their places are unknown")]
 
 

@@ -205,6 +205,7 @@ class Builder:
         others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
             self.arrays["station_name"] = np.array(stations.names)
+            self.arrays |= {} if stations.label is None else {"station_label": np.array(stations.label)}
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
             others["station"] = stations.places
         self._add_places(moving, where)
