@@ -28,7 +28,6 @@ NEIGHBOURS = 5  # rows on each side
 LONG_GAP = 20  # rows without a value in one piece
 EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
-RISE = 0.3  # correlation of level and logarithm of the distance
 WEAK_DB = 6.0  # above the weakest value: heard only just
 
 
@@ -39,7 +38,7 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         levels: of powers.
         steps: `steps_of` them.
     """
-    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
+    warnings = level_warnings(levels.level_db) + copies(levels)
     return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
 
 
@@ -71,17 +70,12 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
         values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
-    if low >= 0 and high <= 1:
-        said = f"all levels lie between {low:g} and {high:g}"
-        warnings.append(f"{said}: linear power? then give it as rssi, in W")
-    elif high > HIGHEST_DBM and low >= 0:
-        said = f"levels from {low:g} to {high:g} are all positive"
-        warnings.append(f"{said}: losses, percent, or linear? expected dBm")
-    elif high > HIGHEST_DBM:
+    if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
-    elif low >= 0 and (values % 1 == 0).all():
-        warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
+    elif low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
+        said = f"no level of {low:g} to {high:g} is below 0"
+        warnings.append(f"{said}: losses, per cent, an index, or linear (then give it as rssi, in W)?")
     return warnings
 
 
@@ -116,31 +110,6 @@ def not_heard(values: np.ndarray) -> list[float]:
             return marks
         marks += found
         rest = rest[~np.isin(rest, found)]
-
-
-def direction_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of levels that rise with the distance."""
-    if levels.station_position is None:
-        return []
-    rise = _correlation(levels, levels.station_position)
-    if rise <= RISE:
-        return []
-    return [
-        f"levels rise with distance (correlation {rise:.2f}): losses instead of levels (then say "
-        "dataset.columns.rssi_db=HEAD*-1), or are the stations, or x and y, elsewhere?"
-    ]
-
-
-def _correlation(levels: LinkLevels, places: np.ndarray) -> float:
-    """Of level and logarithm of the distance from stations at `places` (T, 2 or 3), median of stations."""
-    away = levels.position[:, : places.shape[1]] - places[levels.station]
-    spread = np.log10(np.maximum(np.linalg.norm(away, axis=1), 1e-3))
-    found = []
-    for _, used in levels.heard():
-        level = levels.level_db[used]
-        if len(used) >= 20 and np.ptp(spread[used]) > 0.3 and np.ptp(level) > 0:
-            found.append(np.corrcoef(spread[used], level)[0, 1])
-    return float(np.median(found)) if found else 0.0
 
 
 def copies(levels: LinkLevels) -> list[str]:
