@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-SIZE_M = 100.0  # codes fill a cube of about this edge, so that lengths are of the order of metres
+SIZE_M = 100.0  # four deviations of the first coordinate, so that lengths are of the order of metres
 
 
 def encode_positions(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -13,13 +13,11 @@ def encode_positions(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
     Neighbours in the features' three principal directions are neighbours; distances are not the truth's.
     """
     from sklearn.decomposition import PCA  # here, as it takes a second
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
 
-    known = features(uplink)
-    code = make_pipeline(StandardScaler(), PCA(3, whiten=True, svd_solver="full")).fit(known[rows])
-    # Far outliers of a component stay in the cube.
-    return np.tanh(code.transform(known).astype(np.float64) / 2) * SIZE_M / 2
+    # As they are: scaled to one deviation, what is mostly noise would count like the logarithmic power.
+    known = features(uplink).astype(np.float64)
+    code = PCA(3, svd_solver="full").fit(known[rows])
+    return np.asarray(code.transform(known) * (SIZE_M / 4 / np.sqrt(code.explained_variance_[0])))
 
 
 ANTENNA_PAIRS = 64  # pairs of antennas that are compared, at most; drawn with a fixed seed
