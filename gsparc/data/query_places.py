@@ -10,10 +10,10 @@ import numpy as np
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import ENDS, End
-from gsparc.data.tables.columns import Chosen, choose
+from gsparc.data.tables.columns import Chosen, choose_columns
 from gsparc.data.tables.heads import AXES
-from gsparc.data.tables.opening import sheet_of
-from gsparc.data.tables.places import Places, places
+from gsparc.data.tables.opening import read_sheet
+from gsparc.data.tables.places import Places, read_places
 from gsparc.data.tables.read import NOTHING
 from gsparc.data.tables.sheet import Sheet
 
@@ -63,7 +63,7 @@ def read_query_places(
         DataError: no file, no places, or a place that is none; the first problem, with row and column.
     """
     try:
-        return _of_sheet(*sheet_of(path), moving, columns)
+        return _of_sheet(*read_sheet(path), moving, columns)
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
         first = error.problems[0].replace("dataset.columns", "columns")
@@ -78,7 +78,7 @@ def read_times(path: str | Path) -> np.ndarray | None:
     Raises:
         DataError: no such file, or a time that is no number, with its row.
     """
-    sheet, _ = sheet_of(path)
+    sheet, _ = read_sheet(path)
     if "time_s" not in sheet.heads:
         return None
     times = sheet.numbers("time_s")
@@ -92,9 +92,9 @@ def read_times(path: str | Path) -> np.ndarray | None:
 def _of_sheet(
     sheet: Sheet, notes: list[str], moving: Sequence[End], columns: Mapping[str, object]
 ) -> QueryPlaces:
-    chosen, guessed = choose(sheet, columns, only=GUESSED)
+    chosen, guessed = choose_columns(sheet, columns, only=GUESSED)
     sheet.problems.raise_if_any()
-    by_end = {end: places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
+    by_end = {end: read_places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
     sheet.problems.raise_if_any()
     rest = {end: where for end, where in by_end.items() if where is not None}
     ends: dict[End, Places] = {}

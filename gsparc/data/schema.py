@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
-from gsparc.data.files import shipped
+from gsparc.data.files import read_shipped_table
 from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
@@ -379,7 +379,7 @@ class Field:
     meaning: str
 
 
-FIELDS = {one["name"]: Field(**one) for one in shipped("gsparc.data", "fields.csv")}
+FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data", "fields.csv")}
 
 # Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
 REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"

@@ -162,7 +162,7 @@ def decide(probe: Probe, settings: AutoSettings) -> Choice:
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
     # The cheapest first: the search ends soon after the first set that holds.
-    sets = sorted(combinations(full, removable), key=lambda effects: price(effects, full))
+    sets = sorted(combinations(full, removable), key=lambda effects: relative_cost(effects, full))
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
@@ -194,13 +194,13 @@ def fewer_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Pat
     return replace(choice, table=table, samples=samples if enough else None)
 
 
-def everything(choice: Choice, full: PropagationEffects) -> Choice:
+def keep_everything(choice: Choice, full: PropagationEffects) -> Choice:
     """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
 
 
-def without_fewer_rays(choice: Choice) -> Choice:
+def keep_all_rays(choice: Choice) -> Choice:
     """Return the choice, whose fewer rays the held-back receivers refute."""
     return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
 
@@ -220,11 +220,11 @@ def allowed_failures(count: int, quantile: float, confidence: float) -> int:
     return max(most - int(binom.cdf(most, count, wrong) > risk), 0)
 
 
-def price(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
+def relative_cost(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
     """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
 
     >>> full = PropagationEffects(depth=5)
-    >>> price(full, full), price(full.without("diffuse"), full) < 1
+    >>> relative_cost(full, full), price(full.without("diffuse"), full) < 1
     (1.0, True)
     """
     off = [name for name in full.on if name not in effects.on]
@@ -239,7 +239,7 @@ def _cheapest(
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
     enough: list[PropagationEffects] = []
     for effects in sets:
-        if enough and price(effects, full) > (1 + SIMILAR) * price(enough[0], full):
+        if enough and relative_cost(effects, full) > (1 + SIMILAR) * relative_cost(enough[0], full):
             break
         if holds(effects):
             enough.append(effects)

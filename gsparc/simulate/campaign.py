@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays, together
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.convergence import Convergence, convergence
+from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Changed, Decision
 from gsparc.simulate.effects import PropagationEffects
-from gsparc.simulate.scenes.build import build
+from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.survey import Survey
@@ -59,7 +59,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
         raise ValueError(f"out={out} exists; remove it or choose another")
     # One more than there are stages: their differences are what each took.
     laps = [time.perf_counter()]
-    survey = build(campaign.scene, campaign.sampling)
+    survey = build_survey(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()})
     laps.append(time.perf_counter())
     effects, choice, changed, left_out = campaign.effects, None, None, deciding.NONE
@@ -74,8 +74,8 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     laps.append(time.perf_counter())
     _trace_all(campaign, survey, effects, shards)
     laps.append(time.perf_counter())
-    rows = together(shards, len(survey))
-    error = convergence(campaign, survey, effects, rows.arrays, left_out)
+    rows = join_shards(shards, len(survey))
+    error = measure_convergence(campaign, survey, effects, rows.arrays, left_out)
     laps.append(time.perf_counter())
     # Seconds of all but the shards, which keep their own over interruptions.
     other_s = laps[1] - laps[0] + laps[4] - laps[3]
@@ -117,7 +117,7 @@ class _Tracing:
         if self.shards.path(number).exists():
             return
         if self.survey is None:
-            self.survey = build(self.campaign.scene, self.campaign.sampling)
+            self.survey = build_survey(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.effects)
         arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
         self.shards.put(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
@@ -131,7 +131,7 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: PropagationEffects, 
     if len(missing) < len(parts):
         log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))
     work = _Tracing(campaign, effects, shards, survey)
-    for _ in each(work, missing, "shards", cost=lambda shard: len(shard[1])):
+    for _ in run_each(work, missing, "shards", cost=lambda shard: len(shard[1])):
         pass
 
 

@@ -39,7 +39,7 @@ class Convergence:
         return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
-def convergence(
+def measure_convergence(
     campaign: Campaign,
     survey: Survey,
     effects: PropagationEffects,

@@ -14,7 +14,7 @@ from gsparc.simulate.attribution import Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
-from gsparc.simulate.scenes.receivers import neighbours
+from gsparc.simulate.scenes.receivers import nearest_rows
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.survey import Survey
 
@@ -98,9 +98,11 @@ class Decider:
             choice, changed = self._verified(choice, choice.effects)
             if choice.refused:
                 log.info("auto: verification on held-back receivers failed; everything is simulated")
-                choice = auto.everything(choice, self.full)
+                choice = auto.keep_everything(choice, self.full)
         # After the effects, as fewer rays are tried with those that were chosen.
-        whole, thin = (auto.price(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays))
+        whole, thin = (
+            auto.relative_cost(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays)
+        )
         saved, trial = self.left * (whole - thin), len(self.both) * thin + COMPILING
         if self.survey.engine.random and saved > TRIAL * trial:
             choice, changed = self._with_fewer_rays(choice, changed)
@@ -123,7 +125,7 @@ class Decider:
     def _nearest(self, rows: np.ndarray) -> np.ndarray:
         """The row of the nearest other place, with the same transmitter, of each of rows (n,)."""
         owner, place = np.divmod(rows, len(self.survey.places))
-        return np.asarray(owner * len(self.survey.places) + neighbours(self.survey.places, place))
+        return np.asarray(owner * len(self.survey.places) + nearest_rows(self.survey.places, place))
 
     def _of(self, rows: np.ndarray) -> Paths:
         return self.paths.take(np.searchsorted(self.rows, rows))
@@ -156,5 +158,5 @@ class Decider:
             return thinned, changed
         verified, errors = self._verified(thinned, fewer.take(held))
         if verified.refused:
-            return replace(auto.without_fewer_rays(thinned), verdict=choice.verdict), changed
+            return replace(auto.keep_all_rays(thinned), verdict=choice.verdict), changed
         return verified, errors

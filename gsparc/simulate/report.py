@@ -14,7 +14,9 @@ STATED = ("deliverable", "probes", "samples")
 
 def choice_table(choice: Choice) -> Table:
     """Return a row per effect: its share of power, errors without it, its cost, kept or dropped."""
-    table = Table(title=f"requirement: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
+    table = Table(
+        title=f"requirement: {choice.deliverable}", caption=describe_choice(choice), caption_justify="left"
+    )
     table.add_column("left out")
     for name in ("power %", "p95", "error", "p95", "probes off"):
         table.add_column(name, justify="right")
@@ -30,7 +32,7 @@ def choice_table(choice: Choice) -> Table:
     return table
 
 
-def verdict(choice: Choice) -> str:
+def describe_choice(choice: Choice) -> str:
     """Return what was chosen, and whether the requirement is met on held-back receivers."""
     chosen = f"needed: {choice.effects}"
     chosen += "" if choice.samples is None else f", {choice.samples:,} rays"
@@ -44,7 +46,7 @@ def verdict(choice: Choice) -> str:
     )
 
 
-def figures(outcome: Outcome) -> dict[str, Any]:
+def summary_facts(outcome: Outcome) -> dict[str, Any]:
     """Return flat facts."""
     dataset = outcome.dataset
     facts: dict[str, Any] = {
@@ -73,7 +75,7 @@ def figures(outcome: Outcome) -> dict[str, Any]:
     return facts
 
 
-def closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
+def closing_sentences(outcome: Outcome, seconds: float, load: float) -> list[str]:
     """Return what a simulation took, and how far two seeds of it are apart, in sentences."""
     count = len(outcome.survey)
     lines = [

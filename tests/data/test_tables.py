@@ -9,7 +9,7 @@ import pytest
 
 from gsparc.data.own import interpret
 from gsparc.data.tables import heads
-from gsparc.data.tables.heads import understand
+from gsparc.data.tables.heads import understand_head
 from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
@@ -32,7 +32,7 @@ STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
     ],
 )  # fmt: skip
 def test_usual_heads(head, role, unit):
-    found = understand(head)
+    found = understand_head(head)
     assert found.role == role and (unit is None or found.unit.name == unit)
 
 

@@ -128,8 +128,12 @@ def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
 
 def test_prices_rank_sets():
     full = PropagationEffects(depth=5)
-    assert auto.price(replace(full, depth=3), full) < auto.price(full.without("diffuse"), full) < 1
-    assert auto.price(full, full) == 1 and auto.price(full, full, 0.3) == pytest.approx(0.44)
+    assert (
+        auto.relative_cost(replace(full, depth=3), full)
+        < auto.relative_cost(full.without("diffuse"), full)
+        < 1
+    )
+    assert auto.relative_cost(full, full) == 1 and auto.relative_cost(full, full, 0.3) == pytest.approx(0.44)
 
 
 def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
@@ -147,7 +151,7 @@ def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
     row = taken.table[-1]
     assert taken.samples == 300 and not row.kept and row.effect == "rays > 300"
     assert row.error == pytest.approx(20 * np.log10(1.05), rel=1e-4)
-    for refused in (tried(4), auto.without_fewer_rays(taken)):
+    for refused in (tried(4), auto.keep_all_rays(taken)):
         assert refused.samples is None and refused.table[-1].kept
     assert Choice.from_dict(dataclasses.asdict(taken)) == taken
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 from gsparc.data.links.georeference import Georeference
 
 if TYPE_CHECKING:
@@ -52,9 +52,9 @@ def read_shapes(
     except FileNotFoundError:
         raise DataError(f"{where}: no such file") from None
     except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
+        raise DataError(f"{where}: not readable as GeoJSON ({explain_error(error)})") from None
     except shapely.errors.ShapelyError as error:
-        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
+        raise DataError(f"{where}: not readable as GeoJSON ({explain_error(error)})") from None
     while (shapely.get_type_id(parts) > POLYGON).any():
         parts = shapely.get_parts(parts)
     kind = shapely.get_type_id(parts)

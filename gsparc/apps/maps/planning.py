@@ -20,7 +20,7 @@ from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import answering
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null, whole
+from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
@@ -236,7 +236,7 @@ def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
 
 
 def _start(value: Sequence[float]) -> np.ndarray:
-    place = finite(value)
+    place = finite_array(value)
     if place.shape not in ((2,), (3,)):
         raise DataError(f"start={value}: [x,y] in metres is needed")
     return place[:2]

@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
 from gsparc.apps.maps.levels import measured, predicted
 from gsparc.data.errors import DataError
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
@@ -121,7 +121,7 @@ def gather(learned: Learned, settings: PromiseSettings) -> Promise:
         unit = cut.unit[tried] + number * (len(data) + 1)
         return evidence_of(less, data, replace(inner, test=tried), unit)
 
-    by_number = dict(each(evidence_without, range(settings.folds), "fits without blocks of places"))
+    by_number = dict(run_each(evidence_without, range(settings.folds), "fits without blocks of places"))
     # In the order of folds, whichever ended first: evidence must not depend on it.
     parts = [by_number[number] for number in range(settings.folds)]
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))

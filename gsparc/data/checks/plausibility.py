@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
-from gsparc.data.errors import some
+from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
+from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 
 NAMED = 5  # wild rows that a station may have, however few its rows
@@ -36,10 +36,15 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
 
     Args:
         levels: of powers.
-        steps: `steps_of` them.
+        steps: `find_level_steps` them.
     """
-    warnings = level_warnings(levels.level_db) + copies(levels)
-    return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
+    warnings = level_warnings(levels.level_db) + duplicate_warnings(levels)
+    return [
+        *warnings,
+        *outlier_row_warnings(levels),
+        *level_step_warnings(levels, steps),
+        *gap_warnings(levels),
+    ]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -79,14 +84,14 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     return warnings
 
 
-def saturation(values: np.ndarray) -> float | None:
+def find_saturation(values: np.ndarray) -> float | None:
     """Return the highest of levels (n,) where it repeats as no level of a receiver does by chance."""
     different, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     piled = len(counts) > 1 and counts[-1] > max(SATURATED * counts.sum(), 10, 5 * counts[-2])
     return float(different[-1]) if piled else None
 
 
-def not_heard(values: np.ndarray) -> list[float]:
+def find_not_heard_marks(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
     At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
@@ -112,7 +117,7 @@ def not_heard(values: np.ndarray) -> list[float]:
         rest = rest[~np.isin(rest, found)]
 
 
-def copies(levels: LinkLevels) -> list[str]:
+def duplicate_warnings(levels: LinkLevels) -> list[str]:
     """Warn of rows of one place and station: copies of equal value, repeated measurements else."""
     import pandas as pd  # here, as it takes half a second
 
@@ -125,7 +130,7 @@ def copies(levels: LinkLevels) -> list[str]:
     warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        warnings.append(f"copies (same place, station and level): {some(same)}; leave them out")
+        warnings.append(f"copies (same place, station and level): {list_first(same)}; leave them out")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
         warnings.append(
@@ -135,18 +140,18 @@ def copies(levels: LinkLevels) -> list[str]:
     return warnings
 
 
-def wild_rows(levels: LinkLevels) -> list[str]:
+def outlier_row_warnings(levels: LinkLevels) -> list[str]:
     """Warn of single rows whose level is far from those before and after them at the same station."""
     warnings = []
-    for t, bad, most in wild_of(levels):
+    for t, bad, most in find_outlier_rows(levels):
         where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
-        rows = some([levels.rows[i] for i in bad])
+        rows = list_first([levels.rows[i] for i in bad])
         warnings.append(f"{where}{rows}: up to {most:.0f} dB from the rows around; wrong?")
     return warnings
 
 
-def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
-    """Return (station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
+def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
+    """Return (station, rows (k,), largest difference [dB]) of rows far from those around them."""
     outliers = []
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
@@ -163,7 +168,7 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
     return outliers
 
 
-def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+def level_step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Warn of stations whose level changes at a row, unexplained by places (`level_steps`)."""
     names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
@@ -181,7 +186,7 @@ def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -
     return warnings
 
 
-def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
+def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Return stations and their steps, which name rows of `levels`."""
     steps = []
     stations = np.unique(levels.station)
@@ -190,12 +195,12 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
         used = np.flatnonzero(levels.station == t)
         where = None if levels.station_position is None else levels.station_position[t]
         where = where if where is not None and np.isfinite(where).all() else None
-        for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
+        for step in detect_level_steps(levels.position[used], levels.level_db[used], where, blocks):
             steps.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return steps
 
 
-def gaps(levels: LinkLevels) -> list[str]:
+def gap_warnings(levels: LinkLevels) -> list[str]:
     """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
 
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
@@ -247,7 +252,7 @@ def gaps(levels: LinkLevels) -> list[str]:
 
 
 def _of(who: list[str], total: int) -> str:
-    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {some(who)}"
+    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {list_first(who)}"
 
 
 @dataclass(frozen=True)

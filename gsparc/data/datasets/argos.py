@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import centred, rounded_rms
-from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
-from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.assemble import centre_positions, rounded_rms
+from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
+from gsparc.data.errors import DataError, Problems, explain_error
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
@@ -62,7 +62,7 @@ def load_argos(
     spacing = float(description.get("spacing_hz", SPACING_HZ))
     carrier = float(description.get("carrier_hz", CARRIER_HZ))
     if align:
-        csi = aligned(csi, tones)
+        csi = remove_uplink_offsets(csi, tones)
     scale = rounded_rms(csi)
     # In complex128, as the reciprocal of a small scale overflows in complex64.
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
@@ -80,7 +80,7 @@ def load_argos(
         stand_in="argos" if simulated else None, target_scale=scale, uplink_array=places - base,
         uplink_hz=frequency[:UPLINK], antennas=chosen,
     )  # fmt: skip
-    return centred(Measurements(
+    return centre_positions(Measurements(
         site, np.tile(base, (len(csi), 1)), where, np.tile(np.eye(3), (len(csi), 1, 1)), target,
         noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
         row_names=[f"snapshot {i}" for i in range(len(csi))], release_split=split,
@@ -89,7 +89,7 @@ def load_argos(
     ))  # fmt: skip
 
 
-def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
+def remove_uplink_offsets(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
     """Return snapshots (S, A, K) without mean delay and phase of their uplink (its tones come first)."""
     uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
     step = np.diff(numbers)[0]
@@ -126,13 +126,13 @@ def _loaded(path: Path, expected: str) -> np.ndarray:
     except FileNotFoundError:
         raise DataError(f"{path}: missing; {expected}") from None
     except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable ({reason(error)})") from None
+        raise DataError(f"{path}: not readable ({explain_error(error)})") from None
 
 
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
     # One description may hold the antennas of the files of 8 and of 64.
     key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
-    places = finite(description.get(key))
+    places = finite_array(description.get(key))
     if places.shape != (count, 3):
         raise DataError(
             f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
@@ -186,4 +186,4 @@ class ArgosSim(Argos):
     def load(self) -> Measurements:
         """Load as `Argos.load` does, without a word about the release."""
         assert self.stand_in is not None
-        return simulated(self.stand_in, self.called, self.read)
+        return load_stand_in(self.stand_in, self.called, self.read)

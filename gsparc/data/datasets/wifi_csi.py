@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.wifi_logs import READERS, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
-from gsparc.data.errors import DataError, some
+from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import read_csv
 from gsparc.data.limits import choice
 from gsparc.data.raw import Raw
@@ -35,7 +35,7 @@ WEAK_DB, STRONG_DB = -20.0, 10.0  # of a subcarrier beside the others: nothing i
 KEPT_DB = 2.0  # between the channel's power and RSSI, less a constant: the level is in the channel
 
 
-def raw_of_wifi_csi(
+def read_wifi_csi(
     path: str | Path,
     places: str | Path | None = None,
     chip: str = CHIPS[0],
@@ -69,7 +69,7 @@ def raw_of_wifi_csi(
         raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
     kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
     if len(kinds) > 1:
-        said = f"antennas, subcarriers and carriers {some(kinds)}"
+        said = f"antennas, subcarriers and carriers {list_first(kinds)}"
         raise DataError(f"{path}: {said}; give each a folder of its own")
     carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
@@ -164,7 +164,11 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     if not (kept & right).any():
         raise DataError(f"{path}: no subcarrier has a level; is it a log of another card or chip?")
     if not (kept & right).all():
-        odd = f", and {some(list(tone[kept & ~right]))}: their level is none" if (kept & ~right).any() else ""
+        odd = (
+            f", and {list_first(list(tone[kept & ~right]))}: their level is none"
+            if (kept & ~right).any()
+            else ""
+        )
         what = f"{(kept & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
         log.info("%s: %s%s", path, what, odd)
     return tone[kept & right], csi[..., kept & right]
@@ -189,7 +193,7 @@ def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.nda
 
 
 class WifiCsi(Campaign):
-    """Wi-Fi channels as cards log them; settings of `raw_of_wifi_csi` and `Campaign`."""
+    """Wi-Fi channels as cards log them; settings of `read_wifi_csi` and `Campaign`."""
 
-    choice, reader = "wifi_csi", staticmethod(raw_of_wifi_csi)
+    choice, reader = "wifi_csi", staticmethod(read_wifi_csi)
     inside = "*.pcap"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 
 HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
 TONES_40 = np.array([*range(-58, 0, 4), *range(2, 59, 4)])  # of 128 that it reports there
@@ -72,7 +72,7 @@ def read_packets(path: Path, chip: str = "43455c0") -> Packets:
     except DataError:
         raise
     except Exception as error:  # `csiread` raises anything
-        raise DataError(f"{path}: not readable as a log of {card} ({reason(error)})") from None
+        raise DataError(f"{path}: not readable as a log of {card} ({explain_error(error)})") from None
     if not len(packets.csi):
         raise DataError(f"{path}: no packet with a channel in it; is it a log of {card}?")
     return packets
@@ -84,7 +84,7 @@ def channel_hz(channel: int) -> float:
     return 1e6 * (first + 5 * channel)
 
 
-def address(octets: np.ndarray) -> np.ndarray:
+def format_address(octets: np.ndarray) -> np.ndarray:
     """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
     return np.array([":".join(f"{octet:02x}" for octet in one) for one in octets], str)
 
@@ -105,7 +105,7 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     rssi = np.full(len(one), np.nan) if silent else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
     return Packets(
         log.sec[one] + log.usec[one] * (1e-9 if log.nano else 1e-6),
-        address(log.src_addr[one]),
+        format_address(log.src_addr[one]),
         log.csi[one, None],
         np.fft.fftfreq(points, 1 / points).round().astype(int),  # in the order of an FFT
         np.where(rssi < 0, rssi, np.nan),
@@ -133,7 +133,7 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
         own = read_log(path)
         power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
-        sender = address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
+        sender = format_address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
         return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
     at, count = 0, 0
     while at + 2 < len(content):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.links.strongest import Lists, moments
+from gsparc.data.links.strongest import StrongestLists, number_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
 from gsparc.data.selection import take_rows
@@ -39,9 +39,9 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return
-    moment = moments(arrays["place"][heard], of[heard])
+    moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
-    lists = Lists.of(moment, of[heard], levels[heard], moving, count)
+    lists = StrongestLists.of(moment, of[heard], levels[heard], moving, count)
     if not lists.recognised():
         return
     # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.

@@ -14,7 +14,14 @@ import numpy as np
 from gsparc.data.links.absent import add_absent, add_unlisted
 from gsparc.data.links.hearing import POWERS, censor_rows
 from gsparc.data.links.positions import positions_in_metres
-from gsparc.data.links.stations import SECTOR, by_carrier, ends_of, numbered, station_of_row, station_table
+from gsparc.data.links.stations import (
+    SECTOR,
+    find_static_end,
+    number_places,
+    read_station_of_row,
+    read_station_table,
+    split_by_carrier,
+)
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, Links, Stations
@@ -26,7 +33,7 @@ STATION_FIELDS = (
 OF_ROWS = ("station", "place", "run")  # arrays that go into `Links`
 
 
-def expand(check: Checker, measured: str, part: Selection) -> Links | None:
+def expand_links(check: Checker, measured: str, part: Selection) -> Links | None:
     """Replace `check.raw` by one row per link of the plain schema; None where something is wrong (noted).
 
     Args:
@@ -64,7 +71,7 @@ def _selected(check: Checker, measured: str, stations: Stations | None, part: Se
         check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
         runs = check.array("run", arrays[measured].shape[:1])
         arrays |= {} if runs is None else {"run": np.unique(runs, return_inverse=True)[1].reshape(-1)}
-        arrays |= {} if "place" not in arrays else {"place": numbered(arrays["place"])}
+        arrays |= {} if "place" not in arrays else {"place": number_places(arrays["place"])}
     return stations
 
 
@@ -85,9 +92,9 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
         if any(end is None for end in ends):
             return Links("tx")  # what is missing is said where positions are read
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
-        links, moving = ends_of(check, rx, tx), np.hstack([rx, tx])
+        links, moving = find_static_end(check, rx, tx), np.hstack([rx, tx])
     if links.stations is None and moving.ndim == 2 and len(moving) == rows:
-        place = numbered(moving)
+        place = number_places(moving)
         if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on
             arrays["place"] = place
     return censor_rows(check, measured, links)
@@ -96,7 +103,7 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
 def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
-    stations = station_table(check, measured in (*POWERS, "csi"))
+    stations = read_station_table(check, measured in (*POWERS, "csi"))
     ends = check.given("rx_position", "tx_position")
     if len(ends) != 1:
         names = " and ".join(ends) or "neither"
@@ -114,7 +121,7 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
             measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
             "or say which station each row is of with `station` (S,)",
         )  # fmt: skip
-    station = station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
+    station = read_station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
     row = np.repeat(np.arange(rows), 1 if long else count)
     stated = {name: check.real(name, (), (count,), (rows,)) for name in ("carrier_hz", "sensitivity_db")}
     positions = check.real(ends[0], (rows, 3))
@@ -122,7 +129,7 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
         check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
     if len(check.problems) > before or station is None or positions is None:
         return None
-    arrays["place"] = numbered(positions)
+    arrays["place"] = number_places(positions)
     if not long:  # a wide row becomes as many rows as there are stations, side by side
         check.raw = _unrolled(check.raw, measured, count)
     check.raw.arrays["station"] = station
@@ -135,7 +142,9 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
                 check.notes.append(f"{name}: {said}")
     for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
-    stations = by_carrier(check, _selected(check, measured, stations, part) or stations, measured in POWERS)
+    stations = split_by_carrier(
+        check, _selected(check, measured, stations, part) or stations, measured in POWERS
+    )
     absent = check.raw.attributes.get("absent", "auto")
     if long and absent == "silent":
         add_absent(check, measured, len(stations))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.blocks import is_big
-from gsparc.data.checks.plausibility import not_heard, saturation
+from gsparc.data.checks.plausibility import find_not_heard_marks, find_saturation
 from gsparc.data.errors import Caution
 from gsparc.data.limits import number, or_word
 from gsparc.data.own_checks import Checker
@@ -128,7 +128,11 @@ def _note_floor(
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
     """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
     given = check.raw.attributes.get("not_heard")
-    marks = not_heard(values) if given is None else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    marks = (
+        find_not_heard_marks(values)
+        if given is None
+        else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    )
     # `not_heard=[]` keeps minus infinity as a level, too.
     silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
     floor = "sensitivity_db"
@@ -146,7 +150,7 @@ def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndar
     """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
     given = check.raw.attributes.get("saturation_db", "auto")
     SATURATION.check("dataset.saturation_db", given)
-    level = saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
+    level = find_saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
     if level is None:
         return np.zeros(len(values), bool)
     # Both in float32: a file's level may differ from the decimal setting by its rounding.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.checks.plausibility import degree_warnings
-from gsparc.data.errors import Caution, lines_of, some
+from gsparc.data.errors import Caution, list_first, name_row_ranges
 from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.data.own_checks import Checker
 from gsparc.data.selection import take_rows
@@ -47,7 +47,7 @@ def _without_fix(check: Checker, measured: str) -> None:
             continue  # 0, 0 is a place, too, for who measures there
         _unknown_at_zero(check, degrees)
         if null.any():
-            which = lines_of([str(name) for name in arrays["row_name"][null]])
+            which = name_row_ranges([str(name) for name in arrays["row_name"][null]])
             what = f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"
             check.notes.append(Caution(f"{which}: {what}; these {null.sum()} of {rows} rows are left out"))
             check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(~null), rows))
@@ -65,7 +65,7 @@ def _unknown_at_zero(check: Checker, degrees: bool) -> None:
         arrays[name] = arrays[name].astype(np.float64)
         arrays[name][at_zero] = np.nan
     if len(at_zero):
-        who = some([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
+        who = list_first([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
         check.notes.append(Caution(f"stations at 0, 0: {who}: no fix; their places are unknown"))
 
 

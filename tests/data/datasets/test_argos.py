@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cities import city, folder
 
-from gsparc.data.datasets.argos import TONES, aligned, load_argos
+from gsparc.data.datasets.argos import TONES, load_argos, remove_uplink_offsets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 
@@ -38,8 +38,8 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
     csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
     tones = np.array(TONES, dtype=float)
     moved = csi * np.exp(1j * (1.3 - 0.2 * tones))
-    assert np.allclose(aligned(moved, tones), aligned(csi, tones), atol=1e-12)
-    assert np.allclose(np.abs(aligned(csi, tones)), np.abs(csi))
+    assert np.allclose(remove_uplink_offsets(moved, tones), remove_uplink_offsets(csi, tones), atol=1e-12)
+    assert np.allclose(np.abs(remove_uplink_offsets(csi, tones)), np.abs(csi))
 
 
 @pytest.mark.parametrize(
