@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 NONE = np.zeros(0, dtype=np.int64)
 # Receivers that take as long, with everything, as compiling the solver for other effects or rays: counted,
 # as a measured time would let the load of a machine decide what is simulated.
-COMPILING = 200
+COMPILING = 100
 TRIAL = 2  # how much more fewer rays are to save than their trial costs, because it may fail
 
 
