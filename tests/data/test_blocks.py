@@ -176,7 +176,7 @@ def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch,
     refused("csi: shape .* no other array has .1048576,. rows", load_own, tmp_path / "own.npz")
     zeros |= {"rx_position": np.zeros((2**20, 3))}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
-    monkeypatch.setattr(raw, "memory", lambda: 2**29)
+    monkeypatch.setattr(raw, "machine_memory", lambda: 2**29)
     refused("csi: .* too little memory for 360,", load_own, tmp_path / "own.npz")
     with zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive, archive.open("csi.npy", "w") as entry:
         head = {"descr": "<c8", "fortran_order": False, "shape": (10**15,)}
