@@ -118,7 +118,7 @@ def _real(value: Any) -> bool:
 def finite_array(numbers: Any) -> np.ndarray:
     """Return numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite.
 
-    >>> finite_array([[1, 2.5]]), finite([1.0, "2"])
+    >>> finite_array([[1, 2.5]]), finite_array([1.0, "2"])
     (array([[1. , 2.5]]), array([], dtype=float64))
     """
     try:

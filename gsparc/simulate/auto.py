@@ -224,7 +224,7 @@ def relative_cost(effects: PropagationEffects, full: PropagationEffects, rays: f
     """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
 
     >>> full = PropagationEffects(depth=5)
-    >>> relative_cost(full, full), price(full.without("diffuse"), full) < 1
+    >>> relative_cost(full, full), relative_cost(full.without("diffuse"), full) < 1
     (1.0, True)
     """
     off = [name for name in full.on if name not in effects.on]
