@@ -95,11 +95,11 @@ def elsewhere():
             for _ in range(nodes - 1):
                 cluster.add_node(**small)
             address = cluster.address
-        executor.use(executor.Engine(engine, nodes, address))
+        executor.use_engine(executor.Engine(engine, nodes, address))
         return cluster
 
     yield use
-    executor.use(executor.Engine())
+    executor.use_engine(executor.Engine())
     torch.set_num_threads(threads)
     if cluster is not None:
         import ray

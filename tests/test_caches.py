@@ -5,7 +5,7 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 
-from gsparc.data.assemble import identity
+from gsparc.data.assemble import identity_hash
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation.experiment.done import content
@@ -60,11 +60,11 @@ def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, monkeypat
     for renamed in (("one", "three"), ("two", "one")):
         stations = [replace(FACTS["stations"], name=names) for names in (renamed, ("one", "two"))]
         found = [replace(data, site=replace(data.site, stations=one)) for one in stations]
-        assert identity(found[0]) != identity(found[1])
+        assert identity_hash(found[0]) != identity_hash(found[1])
 
 
 def test_facts_are_the_same_after_a_checkpoint(campaign):
     data = campaign("spectrum", 20)
     whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
     again = _site_from(_as_numpy(_plain(asdict(whole), "site")))
-    assert identity(replace(data, site=again)) == identity(replace(data, site=whole))
+    assert identity_hash(replace(data, site=again)) == identity_hash(replace(data, site=whole))

@@ -13,7 +13,7 @@ from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
 from gsparc.commands.shared.plugins import offer_scenes
 from gsparc.models.registry import methods
-from gsparc.simulate.scenes.shipped import shipped
+from gsparc.simulate.scenes.shipped import list_shipped_scenes
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
 SITE = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
@@ -107,7 +107,7 @@ def test_choices_and_names_are_of_today(page):
     code = "\n".join(said(page))
     for group in ("model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"):
         chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", code)
-        offered = ("help", *shipped()) if group == "scene" else ()
+        offered = ("help", *list_shipped_scenes()) if group == "scene" else ()
         written = [name for name in chosen if name not in offered]
         assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()], group
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.console import Console
 
-from gsparc.data.errors import Caution, DataError, gathered
+from gsparc.data.errors import Caution, DataError, group_warnings
 
 SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
 
@@ -33,7 +33,7 @@ def check(
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
+    from gsparc.data.checks.plausibility import find_level_steps, link_levels, plausibility_warnings
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
@@ -45,13 +45,13 @@ def check(
             _line(console, line)
         return False
     levels = link_levels(reading.data)
-    steps = [] if levels is None else steps_of(levels)
+    steps = [] if levels is None else find_level_steps(levels)
     warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
     # Channels and spectra have conventions to be tried, powers of links have levels to be plausible.
     warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
-    for topic, sentence in [*topics, *(("warning", warning) for warning in gathered(warnings))]:
+    for topic, sentence in [*topics, *(("warning", warning) for warning in group_warnings(warnings))]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it

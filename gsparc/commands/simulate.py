@@ -20,7 +20,7 @@ from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import Sampling
-from gsparc.simulate.report import choice_table, closing, figures
+from gsparc.simulate.report import choice_table, closing_sentences, summary_facts
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.scenes.solid import write_mesh
 from gsparc.simulate.settings import Campaign
@@ -74,7 +74,7 @@ def task(config: DictConfig) -> Outcome | None:
         console.print(choice_table(outcome.choice))
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
-        **figures(outcome),
+        **summary_facts(outcome),
         "time/total_s": seconds,
         "time/cpu_s": time.process_time() - busy,  # of all threads: what a busy machine cannot inflate
         "machine/load": load,
@@ -83,7 +83,7 @@ def task(config: DictConfig) -> Outcome | None:
         **summary.provenance(),
     }
     summary.write_summary(run_dir / "summary.json", facts)
-    for line in closing(outcome, seconds, load):
+    for line in closing_sentences(outcome, seconds, load):
         console.print(line, highlight=False, soft_wrap=True, markup=False)
     console.print(f"written to {out}; summary and pictures in {run_dir}", highlight=False, soft_wrap=True)
     return outcome

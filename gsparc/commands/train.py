@@ -20,11 +20,11 @@ from gsparc.commands.shared.output import in_multirun, run_directory, show
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
-from gsparc.data.checks.describe import in_short
+from gsparc.data.checks.describe import summarise
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution
 from gsparc.data.files import SUMMARY, is_address, set_aside
-from gsparc.data.instantiate import find, node_of
+from gsparc.data.instantiate import config_node, import_target
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
@@ -241,7 +241,7 @@ def _check(
 
 def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: Split) -> None:
     """Say what is learned from, and what is guessed."""
-    for topic, sentence in in_short(data, split):
+    for topic, sentence in summarise(data, split):
         log.info("%-10s%s", topic, sentence)
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
@@ -303,7 +303,9 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
     plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
     kind = known().get(method.name)
-    return method.name if plainly and kind and plain(config.model) == node_of(find(kind)) else None
+    return (
+        method.name if plainly and kind and plain(config.model) == config_node(import_target(kind)) else None
+    )
 
 
 def _of_fits(fits: Outcome) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.blocks import blocks, contents
-from gsparc.data.checks.outliers import peaks, too_far, too_strong
+from gsparc.data.blocks import iterate_bytes, row_blocks
+from gsparc.data.checks.outliers import peak_magnitudes, too_far, too_strong
 from gsparc.data.errors import Problems
 from gsparc.data.schema import Measurements
 
@@ -42,13 +42,13 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     rounding keeps any single row (which may be a test row) from influencing it. `weight` is a bool mask of
     measured entries.
     """
-    highest = peaks(values, weight)
+    highest = peak_magnitudes(values, weight)
     usual = ~too_strong(highest)
     peak = float(highest[usual].max(initial=0.0))
     if peak == 0.0:
         return 0.0
     total, count = 0.0, 0
-    for part in blocks(values):
+    for part in row_blocks(values):
         rows = values[part][usual[part]]
         # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
         rows = rows if weight is None else rows[weight[part][usual[part]]]
@@ -66,12 +66,12 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
             continue
         array = np.ascontiguousarray(array)  # of one number too: (1,)
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
-        for part in contents(array):
+        for part in iterate_bytes(array):
             digest.update(part)
     return digest.hexdigest()
 
 
-def identity(data: Measurements) -> str:
+def identity_hash(data: Measurements) -> str:
     """Return the SHA-256 of all that a method learns from, for the names of kept results.
 
     The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in another unit
@@ -87,11 +87,11 @@ def _fact_text(fact: Any) -> str:
     if isinstance(fact, np.ndarray):
         return content_hash({"": fact})
     if is_dataclass(fact):
-        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact)})
+        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact) if one.compare})
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 
-def centred(data: Measurements) -> Measurements:
+def centre_positions(data: Measurements) -> Measurements:
     """Return measurements in world coordinates about the middle of their box, with their hash.
 
     Args:

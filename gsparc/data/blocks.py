@@ -17,7 +17,7 @@ BLOCK = 2**24  # bytes that are in memory at a time
 MEMORY = 2.0**32  # bytes of a machine that does not say it
 
 
-def memory() -> float:
+def machine_memory() -> float:
     """Return the memory of the machine [bytes]."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
@@ -30,19 +30,19 @@ def is_big(array: Any) -> bool:
     return array.size * array.dtype.itemsize >= BIG
 
 
-def blocks(array: Any) -> Iterator[slice]:
+def row_blocks(array: Any) -> Iterator[slice]:
     """Yield rows of about `BLOCK` bytes, in their order; at least one block."""
     each = array.size * array.dtype.itemsize // max(len(array), 1)
     step = max(1, BLOCK // max(each, 1))
     yield from (slice(start, start + step) for start in range(0, max(len(array), 1), step))
 
 
-def contents(array: np.ndarray) -> Iterator[bytes]:
+def iterate_bytes(array: np.ndarray) -> Iterator[bytes]:
     """Yield bytes of an array in the order of its entries, a block at a time."""
     if not array.ndim:
         yield array.tobytes()
         return
-    for part in blocks(array):
+    for part in row_blocks(array):
         yield np.ascontiguousarray(array[part]).tobytes()
 
 
@@ -74,7 +74,7 @@ def _opened(handle: Any, dtype: Any, shape: tuple[int, ...], offset: int) -> OnD
     return OnDisk.of(os.fdopen(handle.detach(), "rb"), dtype, "r", shape, offset)
 
 
-def scratch(shape: tuple[int, ...], dtype: Any) -> OnDisk:
+def allocate_on_disk(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     """Return zeros in a file without a name (in TMPDIR), which is gone when the array is.
 
     Raises:
@@ -87,38 +87,38 @@ def scratch(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     return OnDisk.of(file, dtype, "w+", shape)
 
 
-def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+def allocate(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Return an array to be filled, on disk where it is large.
 
     Raises:
         OSError: no room.
     """
     large = math.prod(shape) * np.dtype(dtype).itemsize >= BIG
-    return scratch(shape, dtype) if large else np.empty(shape, dtype)
+    return allocate_on_disk(shape, dtype) if large else np.empty(shape, dtype)
 
 
 def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return rows (n,) of an array, on disk where they are many and lie there already."""
     if not isinstance(array, np.memmap) or len(rows) * array[:1].nbytes < BIG:
         return array[rows]
-    copy = scratch((len(rows), *array.shape[1:]), array.dtype)
-    for part in blocks(copy):
+    copy = allocate_on_disk((len(rows), *array.shape[1:]), array.dtype)
+    for part in row_blocks(copy):
         copy[part] = array[rows[part]]
     return copy
 
 
-def on_disk(dataset: h5py.Dataset) -> OnDisk:
+def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
     """Return a dataset's values where they are, or, stored in chunks, copied beside them by blocks."""
     offset = dataset.id.get_offset()
     if offset is not None and dataset.dtype.isnative:
         file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)
         return OnDisk.of(file, dataset.dtype, "r", dataset.shape, offset)
-    copy = scratch(dataset.shape, dataset.dtype)
-    for part in blocks(dataset):
+    copy = allocate_on_disk(dataset.shape, dataset.dtype)
+    for part in row_blocks(dataset):
         copy[part] = dataset[part]
     return copy
 
 
-def evenly(count: int, most: int) -> np.ndarray:
+def evenly_spaced(count: int, most: int) -> np.ndarray:
     """Return (n,) int64, at most `most` of `count` numbers in order, evenly from first to last."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)

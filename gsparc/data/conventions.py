@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.blocks import blocks, is_big, scratch
-from gsparc.data.errors import DataError, nearest
+from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
+from gsparc.data.errors import DataError, suggest_nearest
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
@@ -37,7 +37,7 @@ class Convention:
     tried: bool = True
 
 
-def array_of(data: Measurements) -> np.ndarray | None:
+def known_array(data: Measurements) -> np.ndarray | None:
     """Return places (A, 3) [m] of the channel's antennas, receiver frame; None where they are unknown."""
     array = data.site.array if data.site.kind == "csi" else None
     return array if array is not None and len(array) == data.target.shape[1] else None
@@ -48,7 +48,12 @@ def traits(data: Measurements) -> set[str]:
     grid, shape = data.site.grid, data.target.shape[1:]
     if grid is None:
         tones, square = shape[1] > 1, 1 < shape[0] == shape[1]
-        holds = {"channels": True, "tones": tones, "square": square, "antennas": array_of(data) is not None}
+        holds = {
+            "channels": True,
+            "tones": tones,
+            "square": square,
+            "antennas": known_array(data) is not None,
+        }
     else:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
@@ -93,9 +98,9 @@ def _with_delays(data: Measurements) -> Measurements:
     return replace(data, target=data.target * np.exp(-2j * np.pi * turns)[:, None])
 
 
-def without_zeros(data: Measurements) -> Measurements:
+def mask_zero_tones(data: Measurements) -> Measurements:
     """Mark tones that are 0 in all rows and antennas as not measured, like guard tones of OFDM."""
-    heard = [(data.target[part] != 0).any(axis=(0, 1)) for part in blocks(data.target)]
+    heard = [(data.target[part] != 0).any(axis=(0, 1)) for part in row_blocks(data.target)]
     measured = np.broadcast_to(np.any(heard, axis=0), data.target.shape)
     return replace(data, mask=measured if data.mask is None else measured & data.mask)
 
@@ -136,7 +141,7 @@ CONVENTIONS = {
     "array_wavelengths": Convention("array_position in wavelengths", "antennas",
                                     _array(lambda data: LIGHT / float(data.site.tones().mean()))),
     "delays_removed": Convention("the delay of each row taken out", "tones", _with_delays),
-    "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", without_zeros, False),
+    "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", mask_zero_tones, False),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),
     "clockwise": Convention("clockwise azimuth", "spectra",
@@ -148,7 +153,7 @@ CONVENTIONS = {
 }  # fmt: skip
 
 
-def mended(data: Measurements, names: Iterable[str]) -> Measurements:
+def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurements:
     """Return measurements in the schema's conventions, from those of a file that follows the ones named.
 
     Raises:
@@ -156,7 +161,7 @@ def mended(data: Measurements, names: Iterable[str]) -> Measurements:
     """
     chosen = set(names)
     for name in chosen - set(CONVENTIONS):
-        hint = nearest(name, CONVENTIONS, 0.4)
+        hint = suggest_nearest(name, CONVENTIONS, 0.4)
         raise DataError(f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{hint}")
     # In the table's order, not the user's: axes are exchanged before what runs along them is turned.
     for name in [name for name in CONVENTIONS if name in chosen]:
@@ -175,8 +180,8 @@ def _in_blocks(data: Measurements, change: Change) -> Measurements:
     rows = np.arange(len(data))
     # One row tells the shape, dtype, array and grid that the change leads to.
     first = change(data.subset(rows[:1]))
-    values, masks = scratch((len(data), *first.target.shape[1:]), first.target.dtype), []
-    for part in blocks(data.target):
+    values, masks = allocate_on_disk((len(data), *first.target.shape[1:]), first.target.dtype), []
+    for part in row_blocks(data.target):
         changed = change(data.subset(rows[part]))
         values[part] = changed.target
         masks += [] if changed.mask is None else [changed.mask]

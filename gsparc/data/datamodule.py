@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.data.checks import outliers
-from gsparc.data.checks.coherence import allowed
+from gsparc.data.checks.coherence import set_freedom
 from gsparc.data.limits import check_arguments, whole
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
@@ -28,7 +28,7 @@ def steps_per_epoch(pool_size: int, batch_size: int) -> int:
     return -(-pool_size // batch_size)
 
 
-def order(seed: int, step: int, batch_size: int, pool: np.ndarray) -> np.ndarray:
+def rows_of_step(seed: int, step: int, batch_size: int, pool: np.ndarray) -> np.ndarray:
     """Return rows (b,) of step `step` (from 0): a slice of the permutation seeded by (seed, epoch).
 
     Args:
@@ -47,7 +47,7 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
-def share(rows: np.ndarray, rank: int, devices: int) -> np.ndarray:
+def rows_of_device(rows: np.ndarray, rank: int, devices: int) -> np.ndarray:
     """Return rows of a batch for device `rank`, every `devices`-th, at least one: all take the step."""
     mine = rows[rank::devices]
     return mine if len(mine) else rows[rank % len(rows) :][:1]
@@ -87,8 +87,8 @@ class StepLoader:
     def __iter__(self) -> Iterator[Batch]:
         start = self.first_step()
         for step in range(start, (start // len(self) + 1) * len(self)):
-            rows = order(self.seed, step, self.batch_size, self.pool)
-            mine = share(rows, self.rank, self.devices)
+            rows = rows_of_step(self.seed, step, self.batch_size, self.pool)
+            mine = rows_of_device(rows, self.rank, self.devices)
             # A device without a row of its own repeats one, so that it joins the step, with weight 0.
             part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
             yield replace(self.data.batch(mine), share=part)
@@ -148,8 +148,8 @@ class DataModule(pl.LightningDataModule, ABC):
     @cached_property
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
-        data = allowed(self.load(), self.free)
-        for warning in outliers.warnings(data):
+        data = set_freedom(self.load(), self.free)
+        for warning in outliers.outlier_warnings(data):
             log.warning("%s: %s", self.name, warning)
         return data
 

@@ -14,12 +14,12 @@ _Found = TypeVar("_Found")
 MOST = 300  # characters of a message: what was found may be a whole file in one line
 
 
-def shortened(text: str) -> str:
+def shorten(text: str) -> str:
     """Return a text without its middle when it is long."""
     return text if len(text) <= MOST else f"{text[: MOST // 2]} ... {text[-MOST // 3 :]}"
 
 
-def some(names: Sequence[Any], count: int = 5) -> str:
+def list_first(names: Sequence[Any], count: int = 5) -> str:
     """Return the first of several names, and how many more there are."""
     more = f" and {len(names) - count} more" if len(names) > count else ""
     return ", ".join(map(str, names[:count])) + more
@@ -30,16 +30,16 @@ MOST_OF_A_KIND = 3
 NAMES = r"'[^']*'|\b(?:stations?|line|row) [^:, ]+(?:, )?|\S*[/\d]\S*|[^a-z ]"
 
 
-def kind_of(warning: str) -> str:
+def warning_kind(warning: str) -> str:
     """Return what warnings of one kind share: their first words, without names and numbers."""
     return " ".join(re.sub(NAMES, " ", warning).split())[:30]
 
 
-def gathered(warnings: Sequence[str]) -> list[str]:
+def group_warnings(warnings: Sequence[str]) -> list[str]:
     """Return warnings, more than a few of one kind counted as one."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for text in warnings:
-        kinds[kind_of(text)].append(text)
+        kinds[warning_kind(text)].append(text)
     gathered: list[str] = []
     for texts in kinds.values():
         more = f"{texts[0]} (and {len(texts) - 1} more warnings of this kind)"
@@ -47,7 +47,7 @@ def gathered(warnings: Sequence[str]) -> list[str]:
     return gathered
 
 
-def lines_of(rows: Sequence[str], count: int = 5) -> str:
+def name_row_ranges(rows: Sequence[str], count: int = 5) -> str:
     """Name rows (`line 2`, `row 7`), neighbours as `lines 2 to 20`, in at most `count` pieces."""
     numbers = [int(last) if (last := name.rpartition(" ")[2]).isdigit() else -9 for name in rows]
     starts = [i for i in range(len(rows)) if i == 0 or numbers[i] != numbers[i - 1] + 1 or numbers[i] < 0]
@@ -56,16 +56,16 @@ def lines_of(rows: Sequence[str], count: int = 5) -> str:
         what, number = rows[first].rpartition(" ")[::2]
         one = after - first == 1
         pieces.append(rows[first] if one else f"{what}s {number} to {rows[after - 1].rpartition(' ')[2]}")
-    return some(pieces, count)
+    return list_first(pieces, count)
 
 
-def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+def suggest_nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """Return `; did you mean 'gp'?`, or nothing when no known name is close."""
     close = difflib.get_close_matches(name, known, 1, cutoff)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def reason(error: BaseException) -> str:
+def explain_error(error: BaseException) -> str:
     """Say what another library calls wrong, on one line, without what only a programmer could do about it."""
     if isinstance(error, RecursionError):
         return "brackets within brackets, too many"
@@ -106,7 +106,7 @@ class Problems(list[str]):
 
         Returns None, so that a reader that has nothing to return can end with it; so does `add_rows`.
         """
-        self.append(f"{where}: {shortened(what)}")
+        self.append(f"{where}: {shorten(what)}")
 
     def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> Any:
         """Note `what` for each of `rows` (as a user names them), at most `LIMIT` of them."""

@@ -28,7 +28,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from threadpoolctl import threadpool_limits
 
 from gsparc.data import heeded
-from gsparc.data.errors import reason
+from gsparc.data.errors import explain_error
 from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ class Engine(Checked):
 _chosen = Engine()
 
 
-def use(engine: Engine) -> None:
+def use_engine(engine: Engine) -> None:
     """Choose it for this process, or `SettingError`: Ray is not there."""
     global _chosen
     if engine.engine == "ray":
@@ -67,12 +67,12 @@ def use(engine: Engine) -> None:
     _chosen = engine
 
 
-def elsewhere() -> bool:
+def uses_other_processes() -> bool:
     """Tell whether pieces are done in other processes."""
     return _chosen.engine != "process"
 
 
-def each(
+def run_each(
     work: Callable[[_Piece], _Result],
     pieces: Sequence[_Piece],
     what: str = "",
@@ -99,9 +99,9 @@ def each(
     total, ended = sum(map(cost, pieces)), 0.0
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
     began = logged = time.monotonic()
-    if not elsewhere() and threads == 1:
+    if not uses_other_processes() and threads == 1:
         results: Results = ((number, work(pieces[number])) for number in numbers)
-    elif not elsewhere():
+    elif not uses_other_processes():
         results = _in_threads(lambda number: (number, work(pieces[number])), numbers, threads)
     else:
         blob = cloudpickle.dumps((heeded.carried(work), os.getcwd(), torch.get_num_threads()))
@@ -116,7 +116,7 @@ def each(
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
                 logged, left = now, whole - (now - began)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
-            yield number, heeded.brought(result) if elsewhere() else result
+            yield number, heeded.brought(result) if uses_other_processes() else result
 
 
 @lru_cache(maxsize=1)
@@ -177,7 +177,7 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                 lost.update(list(begun))
                 if max(lost.values(), default=TRIES) >= TRIES:
                     raise
-                log.warning("a process died, its work starts again (%s)", reason(error).split(". ")[0])
+                log.warning("a process died, its work starts again (%s)", explain_error(error).split(". ")[0])
 
 
 def _ray() -> Any:

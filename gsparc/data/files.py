@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 
 SUMMARY = "summary.json"  # of a finished run, written last
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
@@ -37,12 +37,12 @@ def is_address(path: object) -> bool:
     return "://" in str(path)
 
 
-class Several(str):
+class SeveralFiles(str):
     """Paths of files that are read as one; as a string, their names joined for messages."""
 
     paths: tuple[str, ...]
 
-    def __new__(cls, paths: Iterable[str | Path]) -> Several:
+    def __new__(cls, paths: Iterable[str | Path]) -> SeveralFiles:
         """Of at least one path."""
         every = tuple(map(str, paths))
         result = super().__new__(cls, ", ".join(every))
@@ -57,25 +57,25 @@ def read_text(path: Path, missing: str, kind: str = "text") -> str:
     except FileNotFoundError:
         raise DataError(f"{path}: {missing}") from None
     except (UnicodeDecodeError, OSError) as error:
-        raise DataError(f"{path}: not readable as {kind} ({reason(error)})") from None
+        raise DataError(f"{path}: not readable as {kind} ({explain_error(error)})") from None
 
 
 def read_csv(path: Path, missing: str) -> list[list[str]]:
     """Read cells of each line, between commas; `DataError` as of `read_text`."""
     text = read_text(path, missing, "CSV text")
     try:
-        return list(csv.reader(map(partial(checked_line, path), count(1), io.StringIO(text))))
+        return list(csv.reader(map(partial(check_line_length, path), count(1), io.StringIO(text))))
     except csv.Error as error:
         raise DataError(f"{path}: not readable as CSV text ({error})") from None
 
 
-def shipped(package: str, name: str) -> list[dict[str, str]]:
+def read_shipped_table(package: str, name: str) -> list[dict[str, str]]:
     """Read rows of a table in CSV that a package brings, by its heads."""
     text = files(package).joinpath(name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))
 
 
-def checked_line(path: str | Path, number: int, line: str) -> str:
+def check_line_length(path: str | Path, number: int, line: str) -> str:
     """Return the line of a table; DataError where it is longer than `LONGEST_LINE`."""
     if len(line) > LONGEST_LINE:
         fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
@@ -124,7 +124,7 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
     except DataError:
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as YAML ({reason(error)})") from None
+        raise DataError(f"{path}: not readable as YAML ({explain_error(error)})") from None
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content
@@ -178,7 +178,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def no_room(error: BaseException | None) -> bool:
+def is_out_of_space(error: BaseException | None) -> bool:
     """Tell whether a full disk, quota or limit is behind an error, or behind what caused it."""
     while error is not None and not isinstance(error, OSError):
         error = error.__cause__ or error.__context__
@@ -191,7 +191,7 @@ def set_aside(folder: Path, *patterns: str) -> bool:
     return any([path.replace(f"{path}.earlier") for path in found])
 
 
-def sweep(folder: Path) -> None:
+def delete_partial_files(folder: Path) -> None:
     """Delete what processes that are gone left half written in a folder that nobody else writes to."""
     for path in [path for above in ("", "*/", "*/*/") for path in folder.glob(f"{above}.*.partial")]:
         pid = path.name.split(".")[-2]

@@ -60,7 +60,7 @@ _reads: Reads | None = None
 
 @contextmanager
 def recording(reads: Reads) -> Iterator[None]:
-    """Note in `reads` what is read meanwhile, in this process and in those that `executor.each` starts."""
+    """Note in `reads` what is read meanwhile, here and in processes that `executor.run_each` starts."""
     global _reads
     before, _reads = _reads, reads
     kinds: Any = {option.kind for option in reads.options}

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from gsparc.data import spacing
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements, TrainTest
-from gsparc.data.spacing import between
+from gsparc.data.spacing import nearest_neighbour_distance
 from gsparc.data.splits import CORNERS, AnySplit, FileSettings, Fold, SplitSettings, make_split
 
 Draws = np.random.Generator
@@ -74,7 +74,7 @@ def inner_folds(
         DataError: fewer than 2 places to cut.
     """
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    positions, place = positions - positions.min(axis=0), spacing.visits(positions, place)
+    positions, place = positions - positions.min(axis=0), spacing.group_visits(positions, place)
     number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
     which, where = which.reshape(-1), positions[known][first]
@@ -99,7 +99,9 @@ def inner_folds(
     return InnerFolds(cut.name, folds, units)
 
 
-def cut_inside(data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int) -> InnerFolds:
+def cut_inner_folds(
+    data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int
+) -> InnerFolds:
     """Return `inner_folds` of measurements.
 
     Where both ends are taken for moving only because stations are learned together, what moves is the other
@@ -132,7 +134,7 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
     if split.name == "sparse":  # as dense as what is learned from: thinned again it would be another task
         whole["name"] = "random"
     if split.name == "blocks" and split.side_m is None:
-        whole["side_m"] = max(spacing.tenth(positions[:, :2]), np.finfo(float).tiny)
+        whole["side_m"] = max(spacing.tenth_of_extent(positions[:, :2]), np.finfo(float).tiny)
     if split.name == "grouped":  # stretches as long as those of the test
         whole["folds"] = max(split.folds - 1, 2)
     return replace(split, **whole)  # type: ignore[arg-type]
@@ -146,7 +148,7 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
         return settings
     places = positions[fold.train]
     gap = float(np.median(cKDTree(places).query(positions[fold.val])[0]))
-    if not gap > FARTHER * (between(places) or gap):
+    if not gap > FARTHER * (nearest_neighbour_distance(places) or gap):
         return settings
     known = np.sort(np.concatenate([fold.train, fold.val]))
     where = positions[known]
@@ -174,7 +176,7 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> 
             except DataError:
                 side /= 2
                 continue
-            return InnerFolds("blocks", folds, spacing.square_of(where[:, :2], side))
+            return InnerFolds("blocks", folds, spacing.number_squares(where[:, :2], side))
     corners = [settings.corner]
     if settings.name == "corner":
         others = [corner for corner in CORNERS if corner != settings.corner]

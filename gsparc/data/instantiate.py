@@ -9,16 +9,16 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-from gsparc.data.errors import DataError, nearest
+from gsparc.data.errors import DataError, suggest_nearest
 from gsparc.data.limits import SettingError
 
 _Kind = TypeVar("_Kind")
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
+def suggest_or_list(name: str, known: Iterable[str]) -> str:
     """Return `; did you mean 'gp'?`, or what there is when nothing is close."""
     known = list(known)
-    return nearest(name, known) or f"; there are {', '.join(sorted(known))}"
+    return suggest_nearest(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
 def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting") -> _Kind:
@@ -37,20 +37,20 @@ def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun
         raise SettingError(f"{group}.{error}") from None
 
 
-def targets(node: Any) -> Iterator[Any]:
+def iterate_targets(node: Any) -> Iterator[Any]:
     """Yield every `_target_` in a config (plain containers), at any depth."""
     if isinstance(node, dict):
         for key, value in node.items():
             if key == "_target_":
                 yield value
             else:
-                yield from targets(value)
+                yield from iterate_targets(value)
     elif isinstance(node, list):
         for value in node:
-            yield from targets(value)
+            yield from iterate_targets(value)
 
 
-def find(path: str) -> Any:
+def import_target(path: str) -> Any:
     """Return what an import path names; None when there is no such thing."""
     module, _, attribute = path.rpartition(".")
     try:
@@ -68,7 +68,7 @@ def refuse_foreign(path: Any) -> None:
         ValueError: it is none.
     """
     ours = isinstance(path, str) and path.startswith("gsparc.")
-    target = find(path) if ours else None
+    target = import_target(path) if ours else None
     if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in OF_FILES):
@@ -88,25 +88,27 @@ def plugins(group: str) -> dict[str, str]:
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])}
 
 
-def node_of(kind: type) -> dict[str, Any]:
+def config_node(kind: type) -> dict[str, Any]:
     """Return the configuration that builds a class: what it takes with defaults; `???` without one.
 
     Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
-    defaults = {name: v for name, default in arguments(kind).items() if (v := _plain(default)) is not _OTHER}
+    defaults = {
+        name: v for name, default in accepted_arguments(kind).items() if (v := _plain(default)) is not _OTHER
+    }
     return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults}
 
 
 _OTHER = object()
 
 
-def arguments(kind: type) -> dict[str, Any]:
+def accepted_arguments(kind: type) -> dict[str, Any]:
     """Return what a class takes, with defaults; `**names` is what its base class, or `hands_on`, takes."""
     if kind is object:
         return {}
     own, base = list(inspect.signature(kind.__init__).parameters.values())[1:], {}  # type: ignore[misc]
     if any(p.kind is p.VAR_KEYWORD for p in own):
-        base = arguments(vars(kind).get("hands_on", kind.__mro__[1]))
+        base = accepted_arguments(vars(kind).get("hands_on", kind.__mro__[1]))
     named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     return {**named, **{name: default for name, default in base.items() if name not in named}}
 

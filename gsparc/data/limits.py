@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, nearest
+from gsparc.data.errors import DataError, suggest_nearest
 
 
 class SettingError(DataError):
@@ -40,7 +40,7 @@ class Limit:
         """Raise `SettingError` unless `value` is allowed for the setting called `name`."""
         if self.holds(value):
             return
-        hint = nearest(value, self.known) if isinstance(value, str) else ""
+        hint = suggest_nearest(value, self.known) if isinstance(value, str) else ""
         raise SettingError(f"{name}={value!r}: {self.words} is needed{hint}")
 
 
@@ -115,10 +115,10 @@ def _real(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def finite(numbers: Any) -> np.ndarray:
+def finite_array(numbers: Any) -> np.ndarray:
     """Return numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite.
 
-    >>> finite([[1, 2.5]]), finite([1.0, "2"])
+    >>> finite_array([[1, 2.5]]), finite_array([1.0, "2"])
     (array([[1. , 2.5]]), array([], dtype=float64))
     """
     try:

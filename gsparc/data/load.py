@@ -16,14 +16,21 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data import spacing
-from gsparc.data.checks.outliers import outliers
+from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError, nearest
-from gsparc.data.instantiate import arguments, find, from_settings, refuse_foreign, suggest, targets
+from gsparc.data.errors import DataError, suggest_nearest
+from gsparc.data.instantiate import (
+    accepted_arguments,
+    from_settings,
+    import_target,
+    iterate_targets,
+    refuse_foreign,
+    suggest_or_list,
+)
 from gsparc.data.limits import SettingError
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
-from gsparc.data.splits import FileSettings, Split, SplitSettings, left_out, make_split, without
+from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
 
 log = logging.getLogger(__name__)
 
@@ -48,14 +55,14 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     if "_target_" not in settings:
         settings = _plain(OmegaConf.merge(_choice(settings.get("name"), choices), settings))
     if not trusted:
-        for path in targets(settings):
+        for path in iterate_targets(settings):
             refuse_foreign(path)
     target, name = settings["_target_"], settings.get("name")
     own = [key for key, node in choices.items() if node["_target_"] == target]
     if own and name is not None and name not in own:
         _choice(name, choices)
         raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
-    kind = find(str(target))
+    kind = import_target(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
         only = "; only gsparc locate takes it" if name == "fingerprints" else ""
         raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule{only}")
@@ -93,13 +100,13 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         DataError: unknown name or key, impossible shares, or a file made for other data.
     """
     settings = split_settings(config)
-    wrong = np.concatenate([np.zeros(0, np.int64), *outliers(data).values()])
+    wrong = np.concatenate([np.zeros(0, np.int64), *find_outliers(data).values()])
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
-        absent = left_out(settings.leave_out, wrong, len(data))
-        return without(split, absent) if len(absent) else split
+        absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
+        return remove_rows(split, absent) if len(absent) else split
     unit = data.run if settings.name == "runs" else data.station
-    place = spacing.visits(data.moving, data.place)
+    place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
         text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
         log.info(text, len(data), len(np.unique(place)))
@@ -137,7 +144,7 @@ def _choices() -> dict[str, DictConfig]:
 
 def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     if str(name) not in choices:
-        hint = nearest(str(name), choices, 0.4)
+        hint = suggest_nearest(str(name), choices, 0.4)
         raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
     return choices[str(name)]
 
@@ -145,7 +152,9 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 def _parameters(kind: Any) -> dict[str, Any]:
     """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
     own = (
-        arguments(kind) if isinstance(kind, type) else _defaults(inspect.signature(kind).parameters.values())
+        accepted_arguments(kind)
+        if isinstance(kind, type)
+        else _defaults(inspect.signature(kind).parameters.values())
     )
     _, *read = inspect.signature(getattr(kind, "reader", lambda path: path)).parameters.values()
     return {**dict.fromkeys(getattr(kind, "switches", ())), **_defaults(read), **own}
@@ -171,7 +180,7 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
             other = PATHS.get(key)
             if other in known:
                 raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
-            raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest(key, known)}")
+            raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest_or_list(key, known)}")
     for key in known:
         if key in needed and accepted.get(key) in (None, "", "???"):
             raise DataError(f"dataset.{key} is not set; say dataset.{key}={key.upper()} for dataset={name}")

@@ -37,7 +37,7 @@ class Snapshots:
     def of(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
         """Arrange rows (S,): the i-th visit of each station to a place is one moment."""
         station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-        moment = moments(data, rows)
+        moment = number_moments(data, rows)
         _, first = np.unique(moment, return_index=True)
         target = np.asarray(data.target[rows])
         if data.mask is not None:
@@ -64,7 +64,7 @@ class Snapshots:
         return factors[self.moment][:, None]
 
 
-def moments(data: Measurements, rows: np.ndarray) -> np.ndarray:
+def number_moments(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return numbers (S,) of the moments of rows; without stations, or places in common, each has its own."""
     if data.station is None or data.place is None:
         return np.arange(len(rows))

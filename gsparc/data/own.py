@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import bad_positions, centred, rounded_rms
-from gsparc.data.blocks import blocks, is_big, scratch
-from gsparc.data.checks.outliers import far_ends, peaks, too_strong
-from gsparc.data.conventions import mended
+from gsparc.data.assemble import bad_positions, centre_positions, rounded_rms
+from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
+from gsparc.data.checks.outliers import check_static_ends, peak_magnitudes, too_strong
+from gsparc.data.conventions import convert_conventions
 from gsparc.data.limits import number, or_null
-from gsparc.data.links.expand import expand
+from gsparc.data.links.expand import expand_links
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements, Site
@@ -57,10 +57,10 @@ def load_own(path: str | Path) -> Measurements:
     Raises:
         DataError: anything is missing or wrong; all problems are listed with array and row.
     """
-    return interpreted(read_raw(path), path)
+    return interpret_and_log(read_raw(path), path)
 
 
-def interpreted(raw: Raw, source: str | Path) -> Measurements:
+def interpret_and_log(raw: Raw, source: str | Path) -> Measurements:
     """Return the measurements of `interpret`; notes are logged."""
     reading = interpret(raw, source)
     for note in reading.notes:
@@ -116,7 +116,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     check.names()
     measured = check.measurement()
     about = _attributes(check, Path(source).stem, measured)
-    links = None if measured is None else expand(check, measured, part)
+    links = None if measured is None else expand_links(check, measured, part)
     # Without a measurement no array has a length to be checked against: nothing more can be said.
     if measured is None or links is None:
         check.problems.raise_if_any()
@@ -184,7 +184,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
         check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
-    data = data if kind == "rssi" else mended(data, named)
+    data = data if kind == "rssi" else convert_conventions(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, links.censored)
@@ -198,7 +198,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     # Variances scale with the square of the amplitude that was divided out.
     noise = None if noise is None else (noise / scale**2).astype(np.float32)
     site = replace(data.site, target_scale=scale)
-    data = centred(replace(data, site=site, target=target, noise_variance=noise))
+    data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
     return Reading(data, tuple(check.notes))
 
 
@@ -288,7 +288,7 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
 def _rows(values: np.ndarray, test: Test, mask: np.ndarray | None = None) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
     flags = []
-    for part in blocks(values):
+    for part in row_blocks(values):
         passed = test(values[part]) if mask is None else test(values[part]) & mask[part]
         flags.append(passed.reshape(len(passed), -1).any(1))
     return np.concatenate(flags)
@@ -317,7 +317,7 @@ def _within_reach(check: Checker, links: Links, ends: Mapping[str, np.ndarray | 
     moving = ends["tx" if links.static_end == "rx" else "rx"]
     if still is None or moving is None or moving.ndim < 2 or not np.isfinite(still).any():
         return
-    fault, certain = far_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
+    fault, certain = check_static_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
     if fault and certain:
         check.problems.add(check.source, fault)
     elif fault:
@@ -380,7 +380,7 @@ def _scaled(
     if name == "rssi_db":
         values = 10 ** (values / 10) * (1 if mask_or_level is None else mask_or_level)
     if name == "spectrum":
-        highest = peaks(values)
+        highest = peak_magnitudes(values)
         largest = float(highest[~too_strong(highest)].max(initial=0.0))
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
@@ -394,7 +394,7 @@ def _scaled(
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         if mask_or_level is not None or name == "rssi_db" or not is_big(values):
             return (values * lift / (scale * lift)).astype(stored), scale
-        target = scratch(values.shape, stored)
-        for part in blocks(values):
+        target = allocate_on_disk(values.shape, stored)
+        for part in row_blocks(values):
             target[part] = values[part].astype(exact) * lift / (scale * lift)
         return target, scale

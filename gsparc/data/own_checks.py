@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
-from gsparc.data.errors import Problems, nearest
+from gsparc.data.errors import Problems, suggest_nearest
 from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
@@ -64,7 +64,9 @@ class Checker:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            if hint := nearest(name, [known for known in FIELDS if known not in self.raw.arrays], 0.6):
+            if hint := suggest_nearest(
+                name, [known for known in FIELDS if known not in self.raw.arrays], 0.6
+            ):
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")

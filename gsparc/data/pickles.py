@@ -12,10 +12,10 @@ import numpy as np
 from numpy._core import multiarray
 from numpy.lib.format import MAGIC_LEN
 
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 
 
-class Stored:
+class Placeholder:
     """Stands in for an object of a class that is not imported.
 
     Attributes:
@@ -23,7 +23,7 @@ class Stored:
         state: what it was given then.
     """
 
-    def __new__(cls, *made_with: Any, **named: Any) -> Stored:
+    def __new__(cls, *made_with: Any, **named: Any) -> Placeholder:
         """Keep the arguments."""
         stored = super().__new__(cls)
         stored.made_with, stored.named, stored.state = made_with, named, None
@@ -39,7 +39,7 @@ class Stored:
     state: Any
 
 
-class FromBuffer(Stored):
+class FromBuffer(Placeholder):
     """Makes the array that bytes hold, as NumPy's function of that name; a pickle cannot alter it."""
 
     def __new__(cls, buffer: Any, dtype: Any, shape: Any, order: Any, *_: Any) -> Any:
@@ -77,16 +77,16 @@ class _Unpickler(pickle.Unpickler):
         if f"{plain}.{name}" in ARRAYS:
             return ARRAYS[f"{plain}.{name}"]
         if f"{module}.{name}" in self.stand_ins:
-            return Stored
+            return Placeholder
         raise DataError(f"asks for {module}.{name}, which is neither an array nor a part of a table: not run")
 
 
-def unpickled(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
-    """Read what a pickle holds, of arrays, plain values and `Stored`.
+def read_pickle(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
+    """Read what a pickle holds, of arrays, plain values and `Placeholder`.
 
     Args:
         path: of the file.
-        stand_ins: full names of classes and functions that `Stored` stands in for.
+        stand_ins: full names of classes and functions that `Placeholder` stands in for.
         npy: whether it lies behind the header of a npy file, as `numpy.save` writes objects.
 
     Raises:
@@ -103,16 +103,16 @@ def unpickled(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
     except Exception as error:  # whatever a damaged pickle makes the parts raise
-        raise DataError(f"{path}: damaged, or no pickle of arrays ({reason(error)})") from None
+        raise DataError(f"{path}: damaged, or no pickle of arrays ({explain_error(error)})") from None
 
 
-def unpickled_frame(path: Path) -> dict[str, np.ndarray]:
+def read_pickled_frame(path: Path) -> dict[str, np.ndarray]:
     """Read columns (rows,) of a pickled pandas table by their names, whatever pandas is installed.
 
     Raises:
-        DataError: as `unpickled`, or it is no table.
+        DataError: as `read_pickle`, or it is no table.
     """
-    frame = unpickled(path, FRAMES)
+    frame = read_pickle(path, FRAMES)
     try:
         blocks, (heads, _) = frame.state["_mgr"].made_with[:2]
         names = heads.made_with[1]["data"]

@@ -1,180 +1,23 @@
-"""Encoders on disk: trained once per data and settings, frozen from then on."""
+"""Pseudo-positions of snapshots: principal components of features of their uplinks."""
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
-
 import numpy as np
-import torch
-from torch import Tensor, nn
 
-from gsparc.data.assemble import content_hash
-from gsparc.data.errors import DataError, reason
-from gsparc.data.files import whole_file
-from gsparc.data.limits import Checked, setting, whole
-from gsparc.data.raw import stored_archive
-
-log = logging.getLogger(__name__)
-
-FORMAT = "gsparc-encoder-1"
+SIZE_M = 100.0  # four deviations of the first coordinate, so that lengths are of the order of metres
 
 
-def load(path: str | Path) -> Autoencoder:
-    """Read an encoder; runs no code from the file.
+def encode_positions(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return pseudo-positions (S, 3) float64 [m] of uplinks (S, A, L) complex, learned from rows (n,) alone.
 
-    Raises:
-        DataError: missing, or not an encoder.
+    Neighbours in the features' three principal directions are neighbours; distances are not the truth's.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path}: no such encoder")
-    try:
-        content = torch.load(stored_archive(path), map_location="cpu", weights_only=True)
-        if content["format"] != FORMAT:
-            raise ValueError(f"format {content['format']!r}")
-        model = Autoencoder(int(content["width"]), EncoderSettings(**content["settings"]))
-        model.load_state_dict(content["model"])
-    except Exception as error:  # whatever a damaged file raises
-        raise DataError(f"{path}: not a gsparc encoder ({reason(error)})") from None
-    return model.eval().requires_grad_(False)
+    from sklearn.decomposition import PCA  # here, as it takes a second
 
-
-def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
-    """Return places (S, 3) float64 of uplinks (S, A, L), of the order of metres.
-
-    Raises:
-        DataError: the encoder was made for other antennas or tones.
-    """
-    inputs = torch.from_numpy(features(uplink))
-    if inputs.shape[1] != len(model.mean):
-        trained = f"the encoder was trained on {len(model.mean)} features"
-        raise DataError(f"{trained}, these uplinks have {inputs.shape[1]}")
-    with torch.no_grad():
-        return model.code(inputs).double().numpy() * model.settings.size_m / 2
-
-
-def encoder_for(
-    folder: Path, settings: EncoderSettings, file: str | Path | None = None
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return what `load_argos` asks for places: uplinks (S, U, L), training rows (n,) to (S, 3) [m].
-
-    By a given encoder `file`, or one trained once on these rows and kept in `folder`. Asking raises
-    `DataError` where the file is no encoder of such uplinks.
-    """
-
-    def encode(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        if file is not None:
-            return places(load(file), uplink)
-        known = {name: np.array(value) for name, value in asdict(settings).items()}
-        content = content_hash({"uplink": uplink[rows], **known})
-        path = folder / f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.pt"
-        if not path.exists():
-            started = time.perf_counter()
-            model = train(torch.from_numpy(features(uplink[rows])), settings)
-            stored = {"format": FORMAT, "settings": asdict(settings), "width": len(model.mean)}
-            with whole_file(path) as partial:
-                torch.save({**stored, "model": model.state_dict()}, partial)
-            log.info("encoder trained in %.1f s: %s", time.perf_counter() - started, path)
-        return places(load(path), uplink)
-
-    return encode
-
-
-CODE = 3
-
-
-@dataclass(frozen=True)
-class EncoderSettings(Checked):
-    """Shape and training of the encoder.
-
-    Attributes:
-        hidden: units of each hidden layer.
-        spread: weight of the term that keeps codes apart.
-        steps: training steps.
-        batch: rows a step.
-        rate: Adam's step size at the start; it falls to zero on a cosine.
-        seed: of everything random.
-        size_m: codes fill a cube of about this edge, so that lengths are of the order of metres.
-    """
-
-    hidden: int = setting(128, whole(1))
-    spread: float = 0.1
-    steps: int = setting(2000, whole(1))
-    batch: int = setting(256, whole(4))
-    rate: float = 2e-3
-    seed: int = 0
-    size_m: float = 100.0
-
-
-class Autoencoder(nn.Module):
-    """Features -> 3 numbers in (-1, 1) -> features.
-
-    Args:
-        width: number of features F.
-        settings: see there.
-    """
-
-    mean: Tensor
-    scale: Tensor
-
-    def __init__(self, width: int, settings: EncoderSettings) -> None:
-        super().__init__()
-        self.settings = settings
-        self.encoder = _layers(width, settings.hidden, CODE)
-        self.decoder = _layers(CODE, settings.hidden, width)
-        # Stored with the encoder: new uplinks are normalised alike.
-        self.register_buffer("mean", torch.zeros(width))
-        self.register_buffer("scale", torch.ones(width))
-
-    def normalised(self, features: Tensor) -> Tensor:
-        """Return features (B, F) with the stored mean and scale removed."""
-        return (features - self.mean) / self.scale
-
-    def code(self, features: Tensor) -> Tensor:
-        """Return places (B, 3) in (-1, 1)."""
-        return torch.tanh(self.encoder(self.normalised(features)) / 2)
-
-
-def _layers(width: int, hidden: int, out: int) -> nn.Sequential:
-    first, second = nn.Linear(width, hidden), nn.Linear(hidden, hidden)
-    return nn.Sequential(first, nn.GELU(), second, nn.GELU(), nn.Linear(hidden, out))
-
-
-def spread(codes: Tensor) -> Tensor:
-    """Return the mean of -log of the distance of codes (B, 3) to the nearest other: small, they fill space.
-
-    Minus the entropy of Kozachenko and Leonenko (1987), up to constants.
-    """
-    apart = torch.cdist(codes, codes) + torch.eye(len(codes), device=codes.device) * 1e3
-    return -(apart.min(dim=1).values + 1e-4).log().mean()
-
-
-def train(features: Tensor, settings: EncoderSettings) -> Autoencoder:
-    """Fit on features (n, F); deterministic in the seed."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    with torch.random.fork_rng():
-        torch.manual_seed(settings.seed)
-        model = Autoencoder(features.shape[1], settings)
-    model.mean.copy_(features.mean(0))
-    model.scale.copy_(features.std(0, correction=0).clamp_min(1e-6))
-    optimizer = torch.optim.Adam(model.parameters(), lr=settings.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.steps)
-    for _ in range(settings.steps):
-        rows = torch.randint(len(features), (settings.batch,), generator=generator)
-        batch = features[rows]
-        codes = model.code(batch)
-        lost = (model.decoder(codes) - model.normalised(batch)).square().mean()
-        loss = lost + settings.spread * spread(codes)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    return model.eval().requires_grad_(False)
+    # As they are: scaled to one deviation, what is mostly noise would count like the logarithmic power.
+    known = features(uplink).astype(np.float64)
+    code = PCA(3, svd_solver="full").fit(known[rows])
+    return np.asarray(code.transform(known) * (SIZE_M / 4 / np.sqrt(code.explained_variance_[0])))
 
 
 ANTENNA_PAIRS = 64  # pairs of antennas that are compared, at most; drawn with a fixed seed

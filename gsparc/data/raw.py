@@ -30,8 +30,8 @@ from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
-from gsparc.data.blocks import BIG, contents, is_big, memory, on_disk
-from gsparc.data.errors import DataError, reason
+from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
+from gsparc.data.errors import DataError, explain_error
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -98,7 +98,7 @@ def write_raw(path: str | Path, raw: Raw) -> None:
             write(partial, raw)
     except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
         match = re.search(r"error message = '([^']+)'", str(error))
-        why = match[1] if match else getattr(error, "strerror", None) or reason(error)
+        why = match[1] if match else getattr(error, "strerror", None) or explain_error(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
@@ -134,7 +134,7 @@ def _digest(raw: Raw) -> str:
         if text:
             digest.update("\0".join(array.ravel()).encode())
         else:
-            for part in contents(array):
+            for part in iterate_bytes(array):
                 digest.update(part)
     for name, value in sorted(raw.attributes.items()):
         digest.update(f"{name}={np.asarray(_plain(value)).tolist()!r};".encode())
@@ -152,7 +152,7 @@ def is_archive(path: Path) -> bool:
         return False
 
 
-def stored_archive(path: Path) -> BytesIO:
+def verified_archive(path: Path) -> BytesIO:
     """Return what `torch.save` wrote, written anew from bytes whose checksums are right.
 
     torch looks at no checksum, takes entries marked as folders for read, and inflates what is deflated
@@ -193,7 +193,7 @@ def _read_npz(path: Path) -> Raw:
         if not is_archive(path):  # numpy would take anything else for a pickle and speak of that
             raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({reason(error)})") from None
+        raise DataError(f"{path}: cannot be read ({explain_error(error)})") from None
     refuse_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -202,7 +202,7 @@ def _read_npz(path: Path) -> Raw:
                     raise KeyError("in the archive twice")
                 arrays[name] = file[name]
     except DAMAGED as error:
-        fault = f"damaged or not an npz file ({reason(error)})"
+        fault = f"damaged or not an npz file ({explain_error(error)})"
         if "allow_pickle" in str(error):
             fault = "holds Python objects; expected plain arrays of numbers"
         raise DataError(f"{path}, {name}: {fault}") from None
@@ -216,7 +216,9 @@ def _read_npz(path: Path) -> Raw:
         if not isinstance(units, dict):
             raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is no table")
     except (ValueError, TypeError, RecursionError) as error:
-        raise DataError(f"{path}, attributes: expected a JSON table as text ({reason(error)})") from None
+        raise DataError(
+            f"{path}, attributes: expected a JSON table as text ({explain_error(error)})"
+        ) from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
@@ -234,7 +236,7 @@ def _stated_npz(path: Path) -> Stated:
 @contextmanager
 def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
     """An HDF5 file and its datasets by name, none larger than it can hold."""
-    fault = read_error(path)
+    fault = hdf5_text_error(path)
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     with h5py.File(path, "r") as file:
@@ -253,7 +255,7 @@ def _read_hdf5(path: Path) -> Raw:
         with _datasets(path, to_disk=True) as (file, items):
             for name, item in items.items():
                 plain = not h5py.check_string_dtype(item.dtype) and not item.dtype.names
-                arrays[name] = on_disk(item) if plain and is_big(item) else _values(item, fixed=True)
+                arrays[name] = map_from_disk(item) if plain and is_big(item) else _values(item, fixed=True)
                 if "units" in item.attrs:
                     units[name] = _plain(item.attrs["units"])
                 if _plain(item.attrs.get("MATLAB_class")) == "char":  # columns first, as all of MATLAB's
@@ -262,7 +264,7 @@ def _read_hdf5(path: Path) -> Raw:
     except DataError:
         raise
     except DAMAGED as error:
-        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({reason(error)})") from None
+        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({explain_error(error)})") from None
     arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
     written = attributes.pop(DIGEST, None)
     raw = Raw(arrays, attributes, units)
@@ -282,7 +284,7 @@ def _read_mat(path: Path) -> Raw:
         try:
             content = loadmat(path)
         except (*DAMAGED, IndexError) as error:
-            raise DataError(f"{path}: damaged or not a MATLAB file ({reason(error)})") from None
+            raise DataError(f"{path}: damaged or not a MATLAB file ({explain_error(error)})") from None
         arrays = {name: array for name, array in content.items() if not name.startswith("__")}
     words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
     for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
@@ -329,7 +331,9 @@ def refuse_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
         f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
         f"{disk} has no room; set TMPDIR to a larger disk": bool(copied)
         and copied + SPARE > disk_usage(disk).free,
-        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": BIG < held > memory() / 2,
+        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": BIG
+        < held
+        > machine_memory() / 2,
     }
     for fault in (text for text, holds in faults.items() if holds):
         raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")
@@ -340,7 +344,7 @@ def numbered_rows(count: int) -> np.ndarray:
     return np.array([f"row {i}" for i in range(count)])
 
 
-def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:
+def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
     """Return the same content with arrays renamed from the keys to the values of `names`."""
     return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
 
@@ -359,7 +363,7 @@ with h5py.File(sys.argv[1], "r") as file:
 """
 
 
-def read_error(path: Path, seconds: float = SECONDS) -> str | None:
+def hdf5_text_error(path: Path, seconds: float = SECONDS) -> str | None:
     """Say why text in HDF5 cannot be read within `seconds`; None when it can, or when there is none."""
     if not _has_heap(path):
         return None

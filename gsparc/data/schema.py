@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
-from gsparc.data.files import shipped
+from gsparc.data.files import read_shipped_table
 from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
@@ -42,6 +42,8 @@ class Stations:
         carrier_hz: (T,) [Hz]; None where all have the site's.
         sector: (T, 6) azimuth from north, tilt below the horizon, widths of the beam across and in height
             [deg], and power [dB], NaN where unknown; None where nothing of it is known.
+        label: (T,) what a list of cells calls them, to be shown; None where that is `name`. It is no fact of
+            the measurements.
     """
 
     position: np.ndarray
@@ -49,6 +51,7 @@ class Stations:
     rotation: np.ndarray | None = None
     carrier_hz: np.ndarray | None = None
     sector: np.ndarray | None = None
+    label: Sequence[str] | None = field(default=None, compare=False)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -58,7 +61,8 @@ class Stations:
         optional = (self.rotation, self.carrier_hz, self.sector)
         rotation, carrier, sector = (None if one is None else one[numbers] for one in optional)
         called = tuple(names or (self.name[i] for i in numbers))
-        return Stations(self.position[numbers], called, rotation, carrier, sector)
+        label = None if self.label is None else tuple(self.label[i] for i in numbers)
+        return Stations(self.position[numbers], called, rotation, carrier, sector, label)
 
 
 @dataclass(frozen=True)
@@ -375,7 +379,7 @@ class Field:
     meaning: str
 
 
-FIELDS = {one["name"]: Field(**one) for one in shipped("gsparc.data", "fields.csv")}
+FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data", "fields.csv")}
 
 # Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
 REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.blocks import take
-from gsparc.data.errors import DataError, nearest, some
-from gsparc.data.instantiate import suggest
+from gsparc.data.errors import DataError, list_first, suggest_nearest
+from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
-from gsparc.data.links.stations import station_number
+from gsparc.data.links.stations import find_station
 from gsparc.data.schema import FIELDS, Stations, axes_from
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
@@ -142,9 +142,11 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 
 
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
-    found = station_number(wanted, stations.name, len(stations))
+    found = find_station(wanted, stations.name, len(stations))
     if found is None:
-        hint = nearest(str(wanted), stations.name, 0.6) or f"; there are {some(stations.name, 9)}"
+        hint = (
+            suggest_nearest(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.name, 9)}"
+        )
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
     return found
 
@@ -174,7 +176,7 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
     known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
     for name in wanted:
         if name not in known:
-            raise DataError(f"dataset.runs={name}: no such run in {source}{suggest(name, known)}")
+            raise DataError(f"dataset.runs={name}: no such run in {source}{suggest_or_list(name, known)}")
     return np.isin(of_row, wanted)
 
 

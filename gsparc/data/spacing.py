@@ -7,8 +7,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gsparc.data.blocks import evenly
-from gsparc.data.links.stations import numbered
+from gsparc.data.blocks import evenly_spaced
+from gsparc.data.links.stations import number_places
 
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
@@ -20,10 +20,10 @@ MIXING = 2**62 + np.array(_ODD)
 EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
-def between(places: np.ndarray) -> float:
+def nearest_neighbour_distance(places: np.ndarray) -> float:
     """Return the median distance [m] from places (n, D) to the nearest other, copies left out; 0 of one.
 
-    >>> between(np.array([[0.0, 0], [0, 0], [0, 2], [0, 4]]))
+    >>> nearest_neighbour_distance(np.array([[0.0, 0], [0, 0], [0, 2], [0, 4]]))
     2.0
     """
     places = np.unique(places, axis=0)
@@ -44,7 +44,7 @@ def usual_step(positions: np.ndarray) -> float:
         # Cells of the current side first, so that visits of one place do not make its step zero.
         places, step = positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]], 0.0
         if len(places) >= FEWEST_PLACES:
-            some = places[evenly(len(places), SAMPLE)]
+            some = places[evenly_spaced(len(places), SAMPLE)]
             step = float(np.median(cKDTree(places).query(some, k=2)[0][:, 1]))
         if step >= 10 * side:
             return step
@@ -52,11 +52,11 @@ def usual_step(positions: np.ndarray) -> float:
     return 0.0
 
 
-def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
+def group_visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
     """Return the place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
 
     >>> line = np.c_[np.arange(20.0), np.zeros(20)]  # every metre, and once more 1 mm beside it
-    >>> visits(np.r_[line, line + 1e-3])[[0, 1, 20, 21]].tolist()
+    >>> group_visits(np.r_[line, line + 1e-3])[[0, 1, 20, 21]].tolist()
     [0, 1, 0, 1]
 
     Args:
@@ -72,7 +72,7 @@ def visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray
         return place
     # A cell's diagonal is a quarter of `reach`: two representatives are at most 1.5 of it apart.
     joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)  # all nearer than `reach`
-    return place if len(np.unique(joined)) == len(places) else numbered(joined[which.reshape(-1), None])
+    return place if len(np.unique(joined)) == len(places) else number_places(joined[which.reshape(-1), None])
 
 
 def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
@@ -88,15 +88,15 @@ def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
     return np.asarray(connected_components(graph)[1][which.reshape(-1)])
 
 
-def tenth(floor: np.ndarray) -> float:
+def tenth_of_extent(floor: np.ndarray) -> float:
     """Return the side [m] of squares of which ten hold the longer side of places (n, 2)."""
     return float(np.ptp(floor, axis=0).max()) / 10 * (1 + 2 * EDGE)
 
 
-def square_of(floor: np.ndarray, side: float) -> np.ndarray:
+def number_squares(floor: np.ndarray, side: float) -> np.ndarray:
     """Return the number (n,) of the square of `side` [m] that each place (n, 2) is in, from zero.
 
-    >>> square_of(np.array([[0.5, 0.5], [0.9, 0.1], [3.5, 0.5]]), side=1.0)
+    >>> number_squares(np.array([[0.5, 0.5], [0.9, 0.1], [3.5, 0.5]]), side=1.0)
     array([0, 0, 1])
     """
     # Counted from zero, which `split_for` puts at the lowest place of the whole campaign.
@@ -125,11 +125,11 @@ def path_order(positions: np.ndarray) -> np.ndarray:
     return np.argsort(positions[:, longest], kind="stable")
 
 
-def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
+def rows_far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
     """Return those `rows` that are more than `distance` [m] away from all `others` (rows).
 
     >>> line = np.arange(5.0)[:, None]
-    >>> far_from(line, np.array([0, 1, 2]), np.array([4]), distance=2.5)
+    >>> rows_far_from(line, np.array([0, 1, 2]), np.array([4]), distance=2.5)
     array([0, 1])
     """
     if len(rows) == 0 or len(others) == 0:
@@ -137,13 +137,13 @@ def far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distan
     return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
 
 
-def far_apart(
+def thin_rows(
     positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
 ) -> np.ndarray:
     """Return a largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m].
 
     >>> line = np.arange(9.0)[:, None]
-    >>> rows = far_apart(line, np.arange(9), distance=2.0, seed=[0])
+    >>> rows = thin_rows(line, np.arange(9), distance=2.0, seed=[0])
     >>> bool(np.diff(rows).min() > 2)
     True
     """

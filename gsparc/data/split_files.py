@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 from gsparc.data.files import whole_file
-from gsparc.data.splits import Fold, Split, indices_hash
+from gsparc.data.splits import Fold, Split, hash_indices
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,9 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
         raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
     # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
+        raise DataError(
+            f"{path}: not a split file ({type(error).__name__}: {explain_error(error)})"
+        ) from None
     if stored_rows != rows:
         raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
     for i, fold in enumerate(folds):
@@ -54,7 +56,7 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
             raise DataError(f"{path}: fold {i} names a row twice (train, val and test must be disjoint)")
         if len(every) and (every.min() < 0 or every.max() >= rows):
             raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
-    if not folds or indices_hash(folds) != stored_hash:
+    if not folds or hash_indices(folds) != stored_hash:
         raise DataError(f"{path}: the indices do not match their sha256; the file was edited or damaged")
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)

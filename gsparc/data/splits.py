@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.schema import TrainTest
-from gsparc.data.spacing import far_apart, far_from, path_order, square_of, tenth
+from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent, thin_rows
 
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs", "none")
 CORNERS = ("--", "-+", "+-", "++")
@@ -188,7 +188,7 @@ def make_split(
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
     rows, left = len(positions), settings.leave_out
-    absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
+    absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
@@ -209,7 +209,7 @@ def make_split(
         pairs = enumerate(_pairs(where, settings, named))
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
     folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
-    return Split(settings.name, folds, indices_hash(folds))
+    return Split(settings.name, folds, hash_indices(folds))
 
 
 def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
@@ -233,10 +233,10 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
     return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
 
 
-def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
+def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
     """Return the rows (n,) int64 of `rows` that `leave_out` names, `outliers` (n,) being those of that name.
 
-    >>> left_out([3, 17], None, rows=20)
+    >>> rows_to_leave_out([3, 17], None, rows=20)
     array([ 3, 17])
 
     Raises:
@@ -249,13 +249,13 @@ def left_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.
     return np.array(absent, dtype=np.int64)
 
 
-def without(split: Split, absent: np.ndarray) -> Split:
+def remove_rows(split: Split, absent: np.ndarray) -> Split:
     """Return the same folds without the rows `absent` (n,)."""
     folds = tuple(fold.each(lambda part: np.setdiff1d(part, absent)) for fold in split.folds)
-    return Split(split.name, folds, indices_hash(folds))
+    return Split(split.name, folds, hash_indices(folds))
 
 
-def indices_hash(folds: tuple[Fold, ...]) -> str:
+def hash_indices(folds: tuple[Fold, ...]) -> str:
     """Return the SHA-256 of all indices of all folds."""
     digest = hashlib.sha256()
     for fold in folds:
@@ -280,7 +280,7 @@ def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
         test = np.concatenate(stretches[fold :: settings.folds])
         # Path order is kept here: the validation stretch is cut from it.
         rest = order[~np.isin(order, test)]
-        pairs.append((far_from(positions, rest, test, settings.buffer_m), np.sort(test)))
+        pairs.append((rows_far_from(positions, rest, test, settings.buffer_m), np.sort(test)))
     return pairs
 
 
@@ -289,10 +289,10 @@ def _blocks(
 ) -> np.ndarray:
     """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
     floor = positions[:, :2]
-    side = settings.side_m or tenth(floor)
+    side = settings.side_m or tenth_of_extent(floor)
     if not side > 0:
         raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
-    square = square_of(floor[rows], side)
+    square = number_squares(floor[rows], side)
     order = np.random.default_rng(seed).permutation(square.max() + 1)
     # Whole squares are added until the share is reached: the test set is never smaller.
     sizes = np.cumsum(np.bincount(square)[order])
@@ -345,13 +345,13 @@ def _corner(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
     count = max(round(settings.test_fraction * len(positions)), 1)
     test = np.sort(np.argsort(depth, kind="stable")[:count])
     rest = np.setdiff1d(np.arange(len(positions)), test)
-    return far_from(positions, rest, test, settings.buffer_m), test
+    return rows_far_from(positions, rest, test, settings.buffer_m), test
 
 
 def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarray, s: SplitSettings) -> Fold:
     """Thin the training rows, then set some of them aside for validation."""
     if s.spacing_m is not None:
-        train = far_apart(positions, train, s.spacing_m, [s.seed, fold, 3])
+        train = thin_rows(positions, train, s.spacing_m, [s.seed, fold, 3])
     # A stream of draws for each purpose (1 thinning, 2 validation, 3 spacing): none shifts another's.
     rng = np.random.default_rng([s.seed, fold, 1])
     keep = len(train) if s.train_count is None else s.train_count

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.files import shipped
+from gsparc.data.files import read_shipped_table
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Unit:
 SCHEMA = {"length": "m", "angle": "deg", "frequency": "Hz", "power": "W", "level": "dBm"}
 _LISTED = [
     Unit(one["name"], one["kind"], float(one["factor"]), float(one["offset"]))
-    for one in shipped("gsparc.data", "units.csv")
+    for one in read_shipped_table("gsparc.data", "units.csv")
 ]
 # Without case: nobody receives megawatts.
 UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}
 
 
-def known(kind: str) -> str:
+def list_units(kind: str) -> str:
     """List the units of a kind, for messages."""
     return ", ".join(unit.name for unit in _LISTED if unit.kind == kind)
 
@@ -91,7 +91,7 @@ class PowerUnit:
         unit, own = UNITS.get(str(name).lower()), WATTS.get(level_unit)
         decibels = unit is not None and unit.kind == "level"
         if unit is None or unit.name not in WATTS or (not decibels and (levels or own is None)):
-            powers = "" if levels else f", {LINEAR}" if own is None else f", {LINEAR}, {known('power')}"
+            powers = "" if levels else f", {LINEAR}" if own is None else f", {LINEAR}, {list_units('power')}"
             raise ValueError(f"unit={name}: of powers in {level_unit} expected dBm, dBW{powers}")
         return cls(unit.name, decibels, scale if own is None else scale * own / WATTS[unit.name])
 
@@ -123,6 +123,6 @@ class PowerUnit:
         return 10 ** ((values - self.raised_db) / 10) if self.decibels else values / self.scale
 
 
-def in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def power_in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
     return 10 * np.log10(mean), DB * np.sqrt(variance) / mean

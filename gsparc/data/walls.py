@@ -13,8 +13,8 @@ import numpy as np
 
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text, read_yaml
-from gsparc.data.instantiate import suggest
-from gsparc.data.limits import finite
+from gsparc.data.instantiate import suggest_or_list
+from gsparc.data.limits import finite_array
 
 EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`), or a mesh *.obj"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
@@ -69,7 +69,7 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
     content = read_yaml(path, f"a table of {EXPECTED}", f"a table of {EXPECTED}")
     for key in content:
         if key not in SIMULATED | {"walls", "room"}:
-            problems.add(path, f"{key}: no such key{suggest(str(key), ['walls', 'room'])}")
+            problems.add(path, f"{key}: no such key{suggest_or_list(str(key), ['walls', 'room'])}")
     room = content.get("room")
     faces, boxes = ([], np.zeros((0, 2, 3))) if room is None else _room(path, room, problems)
     walls = content.get("walls") or []
@@ -78,14 +78,16 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
         walls = []
     for number, wall in enumerate(walls):
         where = f"{path}: walls[{number}]"
-        corners = finite(wall.get("corners_m") if isinstance(wall, dict) else wall)
+        corners = finite_array(wall.get("corners_m") if isinstance(wall, dict) else wall)
         if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
             problems.add(where, "expected corners_m: [[x, y, z], ...] of at least 3 corners [m]")
         # Corners on a line span no plane, and their normal would be rounding.
-        elif area(corners) < SMALLEST_M2:
+        elif polygon_area(corners) < SMALLEST_M2:
             problems.add(where, "its corners lie on a line")
-        elif uneven(corners) > FLAT_M:
-            problems.add(where, f"its corners lie up to {uneven(corners):.2g} m off a plane; split it")
+        elif distance_from_plane(corners) > FLAT_M:
+            problems.add(
+                where, f"its corners lie up to {distance_from_plane(corners):.2g} m off a plane; split it"
+            )
         else:
             faces.append(corners)
     return SceneWalls(tuple(faces), boxes)
@@ -99,15 +101,15 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
         return problems.add(path, "room: expected size_m and boxes_m") or (faces, boxes)
     for key in room:
         if key not in ("size_m", "boxes_m", "reflection"):
-            problems.add(path, f"room.{key}: no such key{suggest(str(key), ['size_m', 'boxes_m'])}")
+            problems.add(path, f"room.{key}: no such key{suggest_or_list(str(key), ['size_m', 'boxes_m'])}")
     if room.get("size_m") is not None:
-        size = finite(room["size_m"])
+        size = finite_array(room["size_m"])
         if size.shape != (3,) or not (size > 0).all():
             problems.add(path, f"room.size_m={room['size_m']}: expected three lengths above 0 [m]")
         else:
             faces = box_faces(np.zeros(3), size)
     if room.get("boxes_m"):
-        corners = finite(room["boxes_m"])
+        corners = finite_array(room["boxes_m"])
         if corners.shape[1:] != (2, 3) or not (corners[:, 0] < corners[:, 1]).all():
             wanted = "expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
             problems.add(path, f"room.boxes_m: {wanted}")
@@ -138,7 +140,7 @@ def _mesh(path: Path, problems: Problems) -> SceneWalls:
     if not all(np.isfinite(face).all() for face in faces):
         problems.add(path, "a vertex is not finite")
     # Exporters write triangles of no area, which have no normal.
-    return SceneWalls(tuple(face for face in faces if area(face) >= SMALLEST_M2), np.zeros((0, 2, 3)))
+    return SceneWalls(tuple(face for face in faces if polygon_area(face) >= SMALLEST_M2), np.zeros((0, 2, 3)))
 
 
 def _corners(values: list[str], corners: list[list[float]]) -> np.ndarray:
@@ -151,7 +153,7 @@ def _corners(values: list[str], corners: list[list[float]]) -> np.ndarray:
 
 def _triangles_or_flat(face: np.ndarray) -> list[np.ndarray]:
     """A face as it is where it is flat, else its fan of triangles."""
-    if len(face) == 3 or area(face) < SMALLEST_M2 or uneven(face) <= FLAT_M:
+    if len(face) == 3 or polygon_area(face) < SMALLEST_M2 or distance_from_plane(face) <= FLAT_M:
         return [face]
     return [face[[0, i, i + 1]] for i in range(1, len(face) - 1)]
 
@@ -169,19 +171,19 @@ def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
     return faces
 
 
-def normal_of(corners: np.ndarray) -> np.ndarray:
+def polygon_normal(corners: np.ndarray) -> np.ndarray:
     """Return the normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
     # About the mean, as far from the origin the cross products would cancel each other.
     about = corners - corners.mean(0)
     return np.asarray(np.cross(about, np.roll(about, -1, axis=0)).sum(0))
 
 
-def area(corners: np.ndarray) -> float:
+def polygon_area(corners: np.ndarray) -> float:
     """Return the area of a polygon (C, 3) [m^2]."""
-    return float(np.linalg.norm(normal_of(corners)) / 2)
+    return float(np.linalg.norm(polygon_normal(corners)) / 2)
 
 
-def uneven(corners: np.ndarray) -> float:
+def distance_from_plane(corners: np.ndarray) -> float:
     """Return the largest distance of corners (C, 3) from their plane [m]."""
-    normal = normal_of(corners)
+    normal = polygon_normal(corners)
     return float(np.abs((corners - corners.mean(0)) @ (normal / np.linalg.norm(normal))).max())

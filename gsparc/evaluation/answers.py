@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.data.errors import DataError
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.data.files import whole_file
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Kind, Site
@@ -169,7 +169,7 @@ def answers(
 
     parts: list[tuple[np.ndarray, Prediction]] = []
     # Blocks may end in any order in other processes: their rows travel with them.
-    for block, prediction in each(predicted, range(len(blocks)), "blocks of places"):
+    for block, prediction in run_each(predicted, range(len(blocks)), "blocks of places"):
         if not parts:
             accept(tuple(prediction.mean.shape[1:]))
         parts.append((blocks[block][1], prediction))

@@ -17,8 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.errors import kind_of
-from gsparc.data.instantiate import suggest
+from gsparc.data.errors import warning_kind
+from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import SettingError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -58,8 +58,8 @@ class Screen(logging.StreamHandler):  # type: ignore[type-arg]
         if record.levelno < logging.WARNING:
             return not f"{record.name}.".startswith(self.quiet)
         message = record.getMessage()
-        count, first = self.warned.get(kind_of(message), (0, message))
-        self.warned[kind_of(message)] = count + 1, first
+        count, first = self.warned.get(warning_kind(message), (0, message))
+        self.warned[warning_kind(message)] = count + 1, first
         return count == 0
 
     def format(self, record: logging.LogRecord) -> str:
@@ -89,7 +89,8 @@ def one_line(error: BaseException) -> str:
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
             return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
-        return f"{group}={choice}: no such choice{suggest(choice, choices(group) or list(error.options))}"
+        hint = suggest_or_list(choice, choices(group) or list(error.options))
+        return f"{group}={choice}: no such choice{hint}"
     if isinstance(error, errors.OverrideParseException):
         return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
     if isinstance(error, errors.ConfigCompositionException) and isinstance(
@@ -137,7 +138,7 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
         return f"{_first(error)} {_first(cause)}"
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
-    hint = suggest(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
+    hint = suggest_or_list(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
     return f"{full}: no such setting{hint}"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import identity
+from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import Fitted, baseline, fitting
@@ -178,7 +178,7 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
     return {
         **{f"dataset/{name}": getattr(data.site, name) for name in names},
         "dataset/kind": data.site.scored,
-        "dataset/identity": identity(data),
+        "dataset/identity": identity_hash(data),
         "dataset/rows": len(data),
         "dataset/simulate_s": None if seconds is None else float(seconds),
     }

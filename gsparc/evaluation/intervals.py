@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.data.units import in_decibels
+from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
@@ -28,7 +28,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     known = np.isfinite(variance) & (variance > 0) & (mean > 0)
     if not known.any():
         return {}
-    mean_db, spread_db = in_decibels(mean[known], variance[known])
+    mean_db, spread_db = power_in_decibels(mean[known], variance[known])
     row = scores.row[known]
     power = data.target[row, 0].astype(np.float64) * data.site.target_scale
     silent = data.side(row) > 0

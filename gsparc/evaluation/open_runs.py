@@ -15,7 +15,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold, Split, indices_hash
+from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import counted
@@ -118,7 +118,7 @@ def open_files(
     if other and others_whole and all(value is None for value in (split or {}).values()):
         none, every = np.zeros(0, np.int64), np.arange(len(data))
         folds = (Fold(none, none, every),) * len(stored)
-        chosen = Split("whole", folds, indices_hash(folds))
+        chosen = Split("whole", folds, hash_indices(folds))
     else:
         chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
     foreign, learned, trained = _foreign(stored, data, chosen)
@@ -177,7 +177,7 @@ def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None
         whole, rows = one.extra.get("split_sha256"), one.extra.get("origin", {}).get("rows")
         if whole is None and rows is None:
             return None
-        answers.append(rows == indices_hash((fold,)) if whole is None else whole == split.sha256)
+        answers.append(rows == hash_indices((fold,)) if whole is None else whole == split.sha256)
     return all(answers)
 
 
@@ -200,7 +200,7 @@ def _foreign(
         return f"{what}; these test rows may have been TRAINED on", None, None
     own, before = trained
     # The same rows under another name or seed of split.
-    if same and indices_hash(before.folds) == indices_hash(chosen.folds):
+    if same and hash_indices(before.folds) == hash_indices(chosen.folds):
         return None, 0, trained
     learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
     for old, fold in zip(before.folds, chosen.folds, strict=True):

@@ -13,7 +13,7 @@ from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, leg
 from gsparc.evaluation.summary import table
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
-from gsparc.simulate.scenes.shipped import shipped
+from gsparc.simulate.scenes.shipped import list_shipped_scenes
 
 # Materials of ITU-R P.2040 depend on frequency; which one does not matter for their names.
 CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
@@ -72,7 +72,7 @@ def _map(
 def shipped_scenes() -> Table:
     """Return size, triangles and materials of every scene that comes with Sionna."""
     rows = []
-    for name in shipped():
+    for name in list_shipped_scenes():
         tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
         size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))

@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.describe import held_out, neighbours, places_of, side_of_squares
+from gsparc.data.checks.describe import (
+    describe_spacing,
+    distinct_places,
+    propose_block_side,
+    rows_in_test_blocks,
+)
 from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.outliers import outliers, too_far
-from gsparc.data.checks.plausibility import LinkLevels, wild_of
+from gsparc.data.checks.outliers import find_outliers, too_far
+from gsparc.data.checks.plausibility import LinkLevels, find_outlier_rows
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, framed, legend_below
@@ -58,10 +63,10 @@ def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     place, count = place[order], len(place)
     far, suspicious = np.zeros((2, count), bool)
     far[which[too_far(data.moving)]] = True
-    for rows in outliers(data).values():
+    for rows in find_outliers(data).values():
         suspicious[which[rows]] = True
     if levels is not None:
-        lost = [rows for _, rows, _ in wild_of(levels)]
+        lost = [rows for _, rows, _ in find_outlier_rows(levels)]
         wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
         suspicious[cKDTree(place + site.origin).query(wild)[1]] = True
     level, label = _levels(data, which, count)
@@ -103,7 +108,7 @@ def draw_site(
 ) -> None:
     """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
-    `levels` are the `link_levels` of powers, `steps` their `plausibility.steps_of`.
+    `levels` are the `link_levels` of powers, `steps` their `plausibility.find_level_steps`.
     """
     places = spots(data, levels)
     points = [places.place[~places.far], still_ends(data)]  # but those far outside
@@ -143,7 +148,7 @@ def _title(data: Measurements, places: Spots) -> str:
     kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
     stations = data.site.stations
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
-    apart = neighbours(places_of(data), data.site.wavelength).partition(";")[0]
+    apart = describe_spacing(distinct_places(data), data.site.wavelength).partition(";")[0]
     return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
 
 
@@ -180,8 +185,8 @@ def _draw_map(
         )
         assert axis.figure is not None
         axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
-    side = side_of_squares(data)
-    test = np.zeros(0, np.int64) if side is None else held_out(data, side)
+    side = propose_block_side(data)
+    test = np.zeros(0, np.int64) if side is None else rows_in_test_blocks(data, side)
     if len(test):
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
@@ -265,7 +270,7 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
             ha="left" if first < len(rows) / 2 else "right", transform=axis.get_xaxis_transform(),
             path_effects=OUTLINE,
         )  # fmt: skip
-    wild = [bad for t, bad, _ in wild_of(levels) if t == station]
+    wild = [bad for t, bad, _ in find_outlier_rows(levels) if t == station]
     for row in np.concatenate([np.zeros(0, np.int64), *wild]):
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
     axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel=f"level [{unit}]")

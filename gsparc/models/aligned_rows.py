@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.data.moments import Snapshots, moments
+from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, alignment_factors, freedom_words
@@ -127,7 +127,7 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
     """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
     numbers = np.zeros(len(known), np.int64) if data.station is None else data.station[known]
     stations = np.unique(numbers)
-    if len(known) >= SHARED * len(stations) * (moments(data, known).max() + 1):
+    if len(known) >= SHARED * len(stations) * (number_moments(data, known).max() + 1):
         return [Snapshots.of(data, known)]
     return [Snapshots.of(data, known[numbers == one]) for one in stations]
 

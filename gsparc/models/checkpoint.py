@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsparc.data.errors import DataError
 from gsparc.data.files import load_yaml, whole_file
-from gsparc.data.raw import stored_archive
+from gsparc.data.raw import verified_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
@@ -145,7 +145,7 @@ def _content(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint")
     try:
-        archive = stored_archive(path)
+        archive = verified_archive(path)
     except ValueError as refused:
         raise CheckpointError(f"{path}: {refused}") from None
     try:

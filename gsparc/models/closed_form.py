@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.instantiate import find, refuse_foreign
+from gsparc.data.instantiate import import_target, refuse_foreign
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, import_path
@@ -91,7 +91,7 @@ def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
     """
     # The class is named by a file: only gsparc's and plugins' are imported.
     refuse_foreign(state["target"])
-    kind = find(state["target"])
+    kind = import_target(state["target"])
     if not issubclass(kind, ClosedForm):
         raise ValueError(f"{state['target']} is not in closed form: train again")
     method = kind()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.inner_folds import cut_inside
+from gsparc.data.inner_folds import cut_inner_folds
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
@@ -66,7 +66,7 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
     budget = context.time_budget()
     errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
     # Two folds at least are cut, though one may be looked at: a single one would test all rows.
-    for inner in cut_inside(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
+    for inner in cut_inner_folds(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
         learned = heard(data, np.union1d(inner.train, inner.val))
         # Rows below or above a level have no value to be wrong by.
         queries = inner.test[data.side(inner.test) == 0]

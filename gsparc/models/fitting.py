@@ -18,9 +18,9 @@ import yaml
 
 from gsparc.data import heeded
 from gsparc.data.assemble import content_hash
-from gsparc.data.errors import some
+from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold, indices_hash
+from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import with_common_phase
 from gsparc.models.checkpoint import Stored
@@ -149,7 +149,7 @@ class Origin:
         """Return the origin of a fit that begins."""
         directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
         auxiliary = content_hash({**directions, "uplink": data.uplink})
-        return cls(data.site, auxiliary, indices_hash((fold,)), context.seed, context.config_yaml)
+        return cls(data.site, auxiliary, hash_indices((fold,)), context.seed, context.config_yaml)
 
     def marks(self) -> dict[str, Any]:
         """Return what a checkpoint has as `extra`; it holds the configuration itself."""
@@ -180,12 +180,12 @@ class Origin:
         differing += _differences(before, now, DECIDING)
         if differing:
             raise ValueError(
-                f"ckpt_path={stored.path}: was trained with {some(differing)}: "
+                f"ckpt_path={stored.path}: was trained with {list_first(differing)}: "
                 "go on with the same, or start again without ckpt_path"
             )
         changed = _differences(before, now, CHANGEABLE)
         if changed:
-            log.warning("continuing from %s, which had %s", stored.path, some(changed))
+            log.warning("continuing from %s, which had %s", stored.path, list_first(changed))
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.executor import each, elsewhere
+from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -134,7 +134,7 @@ class PerStation(Method):
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
         # In other processes stations run side by side: each may take all of the seconds.
-        local = not elsewhere()
+        local = not uses_other_processes()
 
         def fitted(turn: int) -> tuple[Method, FitReport]:
             number = numbers[turn]
@@ -165,7 +165,7 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        fits = dict(each(fitted, range(len(numbers)), f"stations of {self.name}"))
+        fits = dict(run_each(fitted, range(len(numbers)), f"stations of {self.name}"))
         reports = [fits[turn][1] for turn in range(len(numbers))]
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]

@@ -13,7 +13,15 @@ from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gsparc.data import heeded
-from gsparc.data.instantiate import arguments, find, node_of, plugins, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import (
+    accepted_arguments,
+    config_node,
+    import_target,
+    iterate_targets,
+    plugins,
+    refuse_foreign,
+    suggest_or_list,
+)
 from gsparc.data.limits import SettingError
 
 if TYPE_CHECKING:  # brings torch, which a list of choices does not need
@@ -39,7 +47,7 @@ def method_class(name: str) -> type[MethodFactory]:
         return get_class(methods()[name])
     there = known()
     if name not in there:
-        raise ValueError(f"no method is called {name!r}{suggest(name, there)}")
+        raise ValueError(f"no method is called {name!r}{suggest_or_list(name, there)}")
     return get_class(there[name])
 
 
@@ -62,7 +70,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     from gsparc.processes.stored import KINDS
 
     if not trusted:
-        for path in targets(OmegaConf.to_container(node, resolve=False)):
+        for path in iterate_targets(OmegaConf.to_container(node, resolve=False)):
             if path not in KINDS:  # a term of the user's that they have imported
                 refuse_foreign(path)
     with heeded.apart():  # what is handed on is not used yet
@@ -83,13 +91,15 @@ def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str 
     Raises:
         SettingError: a setting that the class does not have, or a group of settings given as one value.
     """
-    kind = find(str(node.get("_target_", (own or {}).get("_target_"))))
+    kind = import_target(str(node.get("_target_", (own or {}).get("_target_"))))
     if not isinstance(kind, type):  # refused where it is built
         return node
-    own = node_of(kind) if own is None else own
-    given, taken = set(node), {*own, *arguments(kind)} - {"_target_"}
+    own = config_node(kind) if own is None else own
+    given, taken = set(node), {*own, *accepted_arguments(kind)} - {"_target_"}
     for name in (name for name in given - taken if not name.startswith("_")):
-        hint = suggest(name, taken).replace("mean '", f"mean '{group}.") if taken else ", which has none"
+        hint = (
+            suggest_or_list(name, taken).replace("mean '", f"mean '{group}.") if taken else ", which has none"
+        )
         raise SettingError(f"{group}.{name}: no such setting of {kind.__name__}{hint}")
     with open_dict(node):
         node.update({name: default for name, default in own.items() if name not in given})

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.checks.coherence import allowed
+from gsparc.data.checks.coherence import set_freedom
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import arguments, suggest
+from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
@@ -70,12 +70,14 @@ def fit(
     except DataError as refused:
         said = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
         raise DataError(said) from None
-    data = allowed(reading.data, align)
+    data = set_freedom(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
     kind, own = method_class(model), settings or {}
-    for name in own.keys() - arguments(kind):
-        raise ValueError(f"settings: model={model!r} has no {name!r}{suggest(name, arguments(kind))}")
+    for name in own.keys() - accepted_arguments(kind):
+        raise ValueError(
+            f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
+        )
     factory = for_stations(kind(**own), data)
     fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)

@@ -8,8 +8,8 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import suggest
-from gsparc.data.links.stations import station_number
+from gsparc.data.instantiate import suggest_or_list
+from gsparc.data.links.stations import find_station
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import ENDS, End, Site
 from gsparc.prediction.query import usual_heights
@@ -125,9 +125,9 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[n
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
         return rows, np.full(len(rows), -1)
     names = list(stations.name)
-    only = None if wanted is None else station_number(wanted, names, len(names))
+    only = None if wanted is None else find_station(wanted, names, len(names))
     if wanted is not None and only is None:
-        raise DataError(f"station={wanted}: no such station{suggest(wanted, names)}")
+        raise DataError(f"station={wanted}: no such station{suggest_or_list(wanted, names)}")
     if queries.station is None:
         # Each row about every station, those of one row side by side.
         every = np.arange(len(names)) if only is None else np.array([only])
@@ -141,7 +141,7 @@ def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[n
     if (number < 0).any():
         row = int(np.argmax(number < 0))
         word = str(queries.station[row])
-        fault = f"{word!r} is no station of the model{suggest(word, names)}"
+        fault = f"{word!r} is no station of the model{suggest_or_list(word, names)}"
         raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
     rows = rows if only is None else np.flatnonzero(number == only)
     if not len(rows):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.links.stations import station_number
+from gsparc.data.links.stations import find_station
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
@@ -107,7 +107,7 @@ class Predictor(InDegrees, Jointly, Judging):
         stations = self.site.stations
         if stations is None:
             raise ValueError(f"at: {self.site.name} has one static end, and no stations")
-        number = station_number(station, stations.name, len(stations))
+        number = find_station(station, stations.name, len(stations))
         if number is None:
             raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.

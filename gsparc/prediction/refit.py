@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.inner_folds import InnerFolds, cut_inside
+from gsparc.data.inner_folds import InnerFolds, cut_inner_folds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
@@ -41,7 +41,7 @@ class Learned:
 
     def cut(self, count: int, seed: int, split: SplitSettings | None = None) -> InnerFolds:
         """Return `count` folds of these rows, cut by `split`; None: as the test rows were."""
-        return cut_inside(self.data, self.fold, split or self.context.split, count, seed)
+        return cut_inner_folds(self.data, self.fold, split or self.context.split, count, seed)
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""

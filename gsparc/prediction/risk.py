@@ -18,7 +18,7 @@ from scipy.special import betainc
 from scipy.stats import binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
-from gsparc.data.spacing import far_apart
+from gsparc.data.spacing import thin_rows
 from gsparc.processes.stored import Stored
 
 RIVALS = ("distance", "gp_variance")
@@ -338,7 +338,7 @@ def accept(
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], promise.bad(evidence.error)
     if apart_m > 0:  # neighbours err together and count as one
-        calibrate = far_apart(evidence.position, calibrate, apart_m, rng)
+        calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
     patch = cells(evidence.position)[calibrate] if spatial else None
     threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)

@@ -16,10 +16,10 @@ import yaml
 
 from gsparc.data.datasets import argos
 from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
-from gsparc.data.datasets.campaign import made_once, write_split
+from gsparc.data.datasets.campaign import make_once, write_split
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.streets import Rays, Streets, trace
+from gsparc.simulate.streets import Rays, Streets, trace_streets
 
 TONES = np.array(argos.TONES)
 FFT = 64  # 20 MHz in 64 tones, of which 52 are used
@@ -47,7 +47,7 @@ class Offsets:
     frequency: float = 0.01
 
 
-def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
+def build_streets(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     """Build nine blocks, a base station in the middle street, `scatterers` lamp posts and parked cars."""
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
@@ -65,10 +65,10 @@ def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     )
 
 
-def array() -> np.ndarray:
+def antenna_array() -> np.ndarray:
     """Return element positions (64, 3) [m] about the base: an upright half-wavelength square, row by row.
 
-    >>> array().shape
+    >>> antenna_array().shape
     (64, 3)
     """
     step = LIGHT / CARRIER_HZ / 2 * (np.arange(SIDE) - (SIDE - 1) / 2)
@@ -96,23 +96,23 @@ class World:
         rows = np.arange(len(self.users)) if rows is None else rows
         parts = []
         for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
-            response = self.rays.at(some).response(array(), CARRIER_HZ, frequency_hz)
+            response = self.rays.at(some).response(antenna_array(), CARRIER_HZ, frequency_hz)
             parts.append(response.astype(np.complex64))
         return np.concatenate(parts)
 
 
-def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
+def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     """Draw `count` users whose packets the base station decodes, in open and in blocked streets.
 
     Raises:
         ValueError: fewer than `count` users are decoded.
     """
-    streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
+    streets, rng = build_streets(seed, scatterers), np.random.default_rng([seed, 2])
     # Many more than wanted: some are in buildings, some too weak to be decoded.
     across = rng.uniform(LOWER, UPPER, (8 * count, 2))
     across = across[streets.open(across)][: 2 * count]
     users = np.column_stack([across, rng.uniform(*HEIGHT_M, len(across))])
-    rays = trace(streets, users, LIGHT / CARRIER_HZ)
+    rays = trace_streets(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
     # Half of the users are heard better than MEDIAN_SNR_DB.
     noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)
@@ -122,7 +122,7 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     return World(users[decoded], rays.at(decoded), noise)
 
 
-def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
+def draw_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
     """Draw measured channels (S, 64, 52) complex64: truth, offsets, noise."""
     rng = np.random.default_rng([seed, 3])
     count = len(truth.users)
@@ -150,13 +150,13 @@ def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
 
 def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatterers: int) -> None:
     """Write `count` snapshots in the release's layout; the folder must not exist."""
-    truth = world(count, seed, scatterers)
-    measured = snapshots(truth, offsets, seed)
+    truth = draw_world(count, seed, scatterers)
+    measured = draw_snapshots(truth, offsets, seed)
     with whole_folder(folder) as partial:
         np.save(partial / "csidata.npy", measured[:, :SIDE])
         np.save(partial / "csidata-64.npy", measured)
         np.save(partial / "positions.npy", truth.users)
-        places = (scene(seed).base + array()).round(6)
+        places = (build_streets(seed).base + antenna_array()).round(6)
         description = {
             "dataset_name": STAND_IN, "carrier_hz": CARRIER_HZ, "spacing_hz": SPACING_HZ,
             "tones": TONES.tolist(), "noise_power": truth.noise_power, "base_station": places[:SIDE].tolist(),
@@ -195,6 +195,6 @@ class ArgosStandIn:
         name = f"{STAND_IN}-{count}-{seed}{'' if self.offsets else '-aligned'}"
         name = name if scatterers == SCATTERERS else f"{name}-{scatterers}"
         own = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
-        return made_once(
+        return make_once(
             Path(self.root) / name, lambda folder: write_argos_sim(folder, count, seed, own, scatterers)
         )

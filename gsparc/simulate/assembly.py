@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsparc.data.blocks import blocks, empty
+from gsparc.data.blocks import allocate, row_blocks
 from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.effects import PropagationEffects
-from gsparc.simulate.paths import ARRAYS, Paths, starts
+from gsparc.simulate.paths import ARRAYS, Paths, group_offsets
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import spectra
@@ -72,18 +72,18 @@ def assemble(
     convergence: Convergence | None,
     seconds: float,
     shards: Shards,
+    rows: Rows,
 ) -> Assembled:
-    """Put the shards, all of them there, together, write the file, drop the shards.
+    """Write the file from what the shards hold (`join_shards`), drop the shards.
 
-    One shard is in memory at a time; what is large is put together on disk. `seconds` [s] were spent on
-    anything but the shards, which know their own; both are the file's `simulate_s`.
+    `seconds` [s] were spent on anything but the shards, which know their own; both are the file's
+    `simulate_s`.
 
     Raises:
         ValueError: nothing reaches any receiver.
     """
     seconds += sum(float(shards.get(n, SECONDS)[SECONDS]) for n in shards.numbers())
-    whole, paths = _together(shards, len(survey))
-    engine = survey.engine
+    whole, paths, engine = rows.arrays, rows.paths, survey.engine
     power = whole["received_power"]
     reached = power > 0
     if not reached.any():
@@ -110,13 +110,23 @@ def assemble(
     return Assembled(data, power, whole["delay_spread"], facts)
 
 
-def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
-    """What the shards hold of all rows, in their order."""
+class Rows(NamedTuple):
+    """What all shards hold: arrays with a row for each of the survey's, by name, and their paths."""
+
+    arrays: dict[str, np.ndarray]
+    paths: Paths
+
+
+def join_shards(shards: Shards, rows: int) -> Rows:
+    """Return what the shards, all of them there, hold of so many rows, in their order.
+
+    One shard is in memory at a time; what is large is put together on disk.
+    """
     counts = np.zeros(rows, dtype=np.int64)
     for number in shards.numbers():
         part = shards.get(number, ROWS, "offsets")
         counts[part[ROWS]] = np.diff(part["offsets"])
-    offsets = starts(counts)
+    offsets = group_offsets(counts)
     whole: dict[str, np.ndarray] = {}
     for number in shards.numbers():
         part = shards.get(number)
@@ -125,9 +135,9 @@ def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
         for name, values in part.items():
             at, length = (place, offsets[-1]) if name in ARRAYS else (own, rows)
             if name not in whole:
-                whole[name] = empty((int(length), *values.shape[1:]), values.dtype)
+                whole[name] = allocate((int(length), *values.shape[1:]), values.dtype)
             whole[name][at] = values
-    return whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS))
+    return Rows(whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS)))
 
 
 def _arrays(
@@ -154,16 +164,16 @@ def _arrays(
         "split_test": np.sort((order[:tests] + each).ravel()),
     }
     if effects.noise_snr_db is not None:
-        power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in blocks(csi)) / csi.size
+        power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in row_blocks(csi)) / csi.size
         variance = power / 10 ** (effects.noise_snr_db / 10)
         # Another stream than the split's, so that noise does not follow what is held out.
         rng = np.random.default_rng(scene.seed + 1)
         for component in (csi.real, csi.imag):  # all of the one, then all of the other
-            for part in blocks(csi):
+            for part in row_blocks(csi):
                 component[part] += np.sqrt(variance / 2) * rng.normal(size=csi[part].shape)
         arrays["csi_noise_variance"] = np.array(variance)
-    arrays["csi"] = empty(csi.shape, np.complex64)
-    for part in blocks(csi):
+    arrays["csi"] = allocate(csi.shape, np.complex64)
+    for part in row_blocks(csi):
         arrays["csi"][part] = csi[part]
     if campaign.spectrum.kind == "bartlett":
         arrays["spectrum_array_position"] = campaign.spectrum.elements(wavelength)

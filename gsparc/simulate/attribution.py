@@ -91,31 +91,9 @@ class Probe:
     nearest: Paths | None = None
 
     @cached_property
-    def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Kinds of paths, by interactions and order (C, 2), and the kind (P,) of each path.
-
-        Sums over kinds serve every set of effects: paths are gone through once.
-        """
-        kinds = np.stack([self.paths.mechanisms, self.paths.order], axis=1)
-        unique, which = np.unique(kinds, axis=0, return_inverse=True)
-        return unique, which.reshape(-1)
-
-    @cached_property
-    def _power(self) -> np.ndarray:
-        """(ports, C, R)."""
-        kinds, which = self._kinds
-        power, count = np.abs(self.paths.gain.astype(np.complex128)) ** 2, len(self.paths)
-        # One number for each pair of a kind and a receiver, so that one pass sums all.
-        cell = which * count + self.paths.owner
-        return np.stack([
-            np.bincount(cell, weights=one, minlength=len(kinds) * count).reshape(-1, count) for one in power.T
-        ])  # fmt: skip
-
-    @cached_property
     def _channels(self) -> np.ndarray:
-        """(C, R, ports x M, K)."""
-        kinds, which = self._kinds
-        return np.stack([self._responses(self.paths.select(which == kind)) for kind in range(len(kinds))])
+        """(R, ports x M, K), with everything."""
+        return self._responses(self.paths)
 
     @cached_property
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
@@ -135,22 +113,12 @@ class Probe:
         Args:
             remaining: effects, here and below; or another trace of these receivers, of fewer rays.
         """
-        full = self._power.sum((0, 1))
-        if isinstance(remaining, Paths):
-            rest = remaining.received_power()
-        else:
-            ports = len(self._power) if remaining.polarisation else 1
-            rest = self._power[:ports, remaining.allows(*self._kinds[0].T)].sum((0, 1))
-        return 1 - rest / np.where(full > 0, full, 1)
+        full = self.paths.received_power()
+        return 1 - self._rest(remaining).received_power() / np.where(full > 0, full, 1)
 
     def nmse(self, remaining: PropagationEffects | Paths) -> np.ndarray:
         """Return the NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
-        full = self._channels.sum(0)
-        if isinstance(remaining, Paths):
-            rest = self._responses(remaining)
-        else:
-            rest = self._channels[remaining.allows(*self._kinds[0].T)].sum(0)
-            rest = rest if remaining.polarisation else rest[:, : len(self.elements)]
+        full, rest = self._channels, self._responses(self._rest(remaining))
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         # A polarisation that is left out is missed whole.
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
@@ -166,11 +134,14 @@ class Probe:
         if deliverable.kind == "csi":
             return 10 * np.log10(np.maximum(self.nmse(remaining), least))
         full, near = self._images
-        rest = remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
         # With nothing left out the image is there already.
-        image = full if remaining == self.effects else self._render(rest)
+        image = full if remaining == self.effects else self._render(self._rest(remaining))
         error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
         return error / np.maximum(nearest, 1e-12)
+
+    def _rest(self, remaining: PropagationEffects | Paths) -> Paths:
+        # Nothing is traced again: without an effect the solver would draw other rays.
+        return remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
 
     def _responses(self, paths: Paths) -> np.ndarray:
         return paths.responses(self.frequency_hz, self.elements, self.wavelength)

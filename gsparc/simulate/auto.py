@@ -15,8 +15,7 @@ from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.paths import Paths
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
-# street canyon and in the conference room (docs/results/simulate.md). It ranks sets of effects; what a choice
-# saves is measured on the rows of the file.
+# street canyon and in the conference room (docs/results/simulate.md).
 PRICE = {
     "line_of_sight": 0.0, "specular": 0.25, "refraction": 0.0, "diffraction": 0.22, "edge_diffraction": 0.1,
     "diffuse": 0.1, "polarisation": 0.02,
@@ -24,8 +23,6 @@ PRICE = {
 BOUNCES = 0.8  # and with the bounces, to equal parts
 RAYS = 0.8  # and with the rays
 SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
-FIRST_LOOK = 0.5  # share of the probes
-SPENT = 1 / 3  # of the permitted probability of error, at the first look
 
 
 @dataclass(frozen=True)
@@ -35,9 +32,9 @@ class AutoSettings:
     Attributes:
         deliverable: the requirement, as text (`attribution.Deliverable.parse`).
         quantile: share of receivers for which it must hold.
-        probes: receivers the decision is measured on at most, at least 16, spread out.
+        probes: receivers the decision is measured on, at least 16, spread out.
         confidence: with which the quantile must follow from them (`allowed_failures`).
-        held_back: other receivers on which the choice is then verified, at most.
+        held_back: other receivers on which the choice is then verified.
         rays: share of the rays that is tried as well, where that may pay; 1 for none.
         full: what "everything on" means.
     """
@@ -46,7 +43,7 @@ class AutoSettings:
     quantile: float = 0.95
     probes: int = 128
     confidence: float = 0.85
-    held_back: int = 128
+    held_back: int = 64
     rays: float = 0.3
     full: PropagationEffects = field(default_factory=lambda: PropagationEffects(depth=5))
 
@@ -64,10 +61,9 @@ class AutoSettings:
         """The requirement."""
         return Deliverable.parse(self.deliverable, self.quantile)
 
-    def allowed_failures(self, heard: int, last: bool) -> tuple[int, int]:
-        """Call `allowed_failures` where so many receivers are all, or those of the first look."""
-        first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
-        return allowed_failures(first, all_, self.quantile, self.confidence)
+    def allowed_failures(self, heard: int) -> int:
+        """Call `allowed_failures` for so many receivers."""
+        return allowed_failures(heard, self.quantile, self.confidence)
 
 
 @dataclass(frozen=True)
@@ -78,8 +74,7 @@ class EffectRow:
         effect: as in `removals`, or `rays > N`.
         share: mean share of a receiver's power.
         share_p95: its 95th percentile over the receivers.
-        nmse, nmse_p95: of the channel, median and 95th percentile.
-        error, error_p95: of the deliverable, likewise.
+        error, error_p95: of the deliverable, median and 95th percentile.
         failures: probes beyond the tolerance.
         kept: whether the requirement needs it.
     """
@@ -87,8 +82,6 @@ class EffectRow:
     effect: str
     share: float
     share_p95: float
-    nmse: float
-    nmse_p95: float
     error: float
     error_p95: float
     failures: int
@@ -122,12 +115,8 @@ class Choice:
         deliverable: the requirement, as text.
         table: one row per effect.
         probes: receivers that it took.
-        seconds: that deciding took, tracing the probes included, which are rows of the file [s].
         samples: rays that are enough, of a call; None for those of the settings.
         refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
-        row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
-            None where none was traced so.
-        compiling: CPU seconds of compiling the solver for a set of effects; None where not measured.
         verdict: filled by `verify`.
     """
 
@@ -135,63 +124,37 @@ class Choice:
     deliverable: str
     table: tuple[EffectRow, ...]
     probes: int
-    seconds: float = 0.0
     samples: int | None = None
     refuted: str = ""
-    row_all: float | None = None
-    row_chosen: float | None = None
-    compiling: float | None = None
     verdict: Verification | None = None
 
     @property
-    def saved(self) -> float | None:
-        """Share of the tracing time that the choice saves against everything; None where not measured.
-
-        None as well where everything is needed: two timings of the same differ by what else the machine does.
-        """
-        if not (self.row_all and self.row_chosen) or all(row.kept for row in self.table):
-            return None
-        return 1 - self.row_chosen / self.row_all
+    def refused(self) -> bool:
+        """Tell whether held-back receivers are outside of the tolerance too often."""
+        return self.verdict is not None and not self.verdict.kept
 
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:
         """Invert `dataclasses.asdict`."""
         verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
         table = tuple(EffectRow(**row) for row in stored["table"])
-        return Choice(
-            **{
-                **stored,
-                "effects": PropagationEffects(**stored["effects"]),
-                "table": table,
-                "verdict": verdict,
-            }
-        )
+        effects = PropagationEffects(**stored["effects"])
+        return Choice(**{**stored, "effects": effects, "table": table, "verdict": verdict})
 
 
-def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | None:
-    """Return the cheapest effects that meet the requirement; None where more probes are needed to say.
-
-    Args:
-        probe: receivers traced with everything: the first look's, or all probes.
-        settings: requirement and confidence.
-        last: whether these are all probes, so that an effect that is not clearly out stays in.
+def decide(probe: Probe, settings: AutoSettings) -> Choice:
+    """Return the cheapest effects that meet the requirement, by receivers traced with everything.
 
     Raises:
         ValueError: nothing reaches any of them.
     """
     full, required, heard = probe.effects, settings.required, int(probe.reached.sum())
     if not heard:
-        if not last:
-            return None
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
-    early, late = settings.allowed_failures(heard, last)
-    most = late if last else early
+    most = settings.allowed_failures(heard)
     rows = [_row(name, probe, less, required) for name, less in removals(full).items()]
-    # Neither clearly needed nor clearly not: all probes are to tell.
-    if any(most < row.failures <= late for row in rows):
-        return None
 
     def holds(effects: PropagationEffects) -> bool:
         errors = probe.errors(effects, required)[probe.reached]
@@ -199,7 +162,7 @@ def decide(probe: Probe, settings: AutoSettings, last: bool = True) -> Choice | 
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
     # The cheapest first: the search ends soon after the first set that holds.
-    sets = sorted(combinations(full, removable), key=lambda effects: price(effects, full))
+    sets = sorted(combinations(full, removable), key=lambda effects: relative_cost(effects, full))
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
@@ -218,78 +181,50 @@ def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice
     return replace(choice, verdict=verdict)
 
 
-def fewer_rays(
-    choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int, last: bool
-) -> Choice | None:
-    """Return the choice with fewer rays, or without them; None where more probes are needed to say.
+def fewer_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int) -> Choice:
+    """Return the choice with so many `samples` where those are enough, or without; a row says which.
 
     Args:
-        choice, settings, probe, last: as of `decide`.
-        traced: the probe's receivers with the choice's effects and so many `samples`.
+        choice, settings, probe: as of `decide`.
+        traced: the probe's receivers with the choice's effects and these samples.
     """
     row = _row(f"rays > {samples}", probe, traced, settings.required)
-    early, late = settings.allowed_failures(int(probe.reached.sum()), last)
-    if not last and row.failures == early + 1:  # with more, a second look would mostly be in vain
-        return None
-    enough = row.failures <= (late if last else early)
+    enough = row.failures <= settings.allowed_failures(int(probe.reached.sum()))
     table = (*choice.table, replace(row, kept=not enough))
     return replace(choice, table=table, samples=samples if enough else None)
 
 
-def everything(choice: Choice, full: PropagationEffects) -> Choice:
+def keep_everything(choice: Choice, full: PropagationEffects) -> Choice:
     """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
 
 
-def without_fewer_rays(choice: Choice) -> Choice:
+def keep_all_rays(choice: Choice) -> Choice:
     """Return the choice, whose fewer rays the held-back receivers refute."""
     return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
 
 
-def first_look(receivers: int) -> int:
-    """Return how many of so many receivers are looked at first.
+def allowed_failures(count: int, quantile: float, confidence: float) -> int:
+    """Return how many of `count` receivers may exceed the tolerance, so that the quantile follows.
 
-    >>> first_look(129)
-    65
-    """
-    return math.ceil(FIRST_LOOK * receivers)
+    Were the requirement violated, no more would exceed it with a probability of at most 1 - confidence
+    (exact binomial); 0 where even none proves nothing.
 
-
-def allowed_failures(first: int, all_: int, quantile: float, confidence: float) -> tuple[int, int]:
-    """Return how many receivers may exceed the tolerance, at the first look and among all, for a proof.
-
-    A test in two stages: were the requirement violated, it would pass one of them with a probability of at
-    most 1 - confidence, a third of which the first look spends (exact binomial probabilities; the first look
-    has -1 where it proves nothing). 0 at the last look where even none proves nothing.
-
-    >>> allowed_failures(10, 20, quantile=0.95, confidence=0.85)  # too few to prove anything
-    (-1, 0)
-    >>> [int(most) for most in allowed_failures(64, 128, quantile=0.95, confidence=0.85)]
-    [0, 3]
+    >>> allowed_failures(128, quantile=0.95, confidence=0.85)
+    3
     """
     wrong, risk = 1 - quantile, 1 - confidence
-    early = int(binom.ppf(risk * SPENT, first, wrong))
+    most = int(binom.ppf(risk, count, wrong))
     # `ppf` is the least count that reaches the risk: one less stays below it.
-    early -= binom.cdf(early, first, wrong) > risk * SPENT
-
-    def passes(late: int) -> float:
-        # Passed at the first look, or failed there and passed at the last.
-        between = np.arange(early + 1, late + 1)
-        rest = binom.pmf(between, first, wrong) * binom.cdf(late - between, all_ - first, wrong)
-        return float(binom.cdf(early, first, wrong) + rest.sum())
-
-    late = max(early, 0)
-    while late < all_ and passes(late + 1) <= risk:
-        late += 1
-    return int(early), late
+    return max(most - int(binom.cdf(most, count, wrong) > risk), 0)
 
 
-def price(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
+def relative_cost(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
     """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
 
     >>> full = PropagationEffects(depth=5)
-    >>> price(full, full), price(full.without("diffuse"), full) < 1
+    >>> relative_cost(full, full), relative_cost(full.without("diffuse"), full) < 1
     (1.0, True)
     """
     off = [name for name in full.on if name not in effects.on]
@@ -304,7 +239,7 @@ def _cheapest(
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
     enough: list[PropagationEffects] = []
     for effects in sets:
-        if enough and price(effects, full) > (1 + SIMILAR) * price(enough[0], full):
+        if enough and relative_cost(effects, full) > (1 + SIMILAR) * relative_cost(enough[0], full):
             break
         if holds(effects):
             enough.append(effects)
@@ -313,11 +248,12 @@ def _cheapest(
 
 def _row(name: str, probe: Probe, less: PropagationEffects | Paths, required: Deliverable) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
-    parts = np.abs(probe.shares(less)), probe.nmse(less), probe.errors(less, required)
-    share, nmse, error = (part[probe.reached] for part in parts)
+    share, error = (
+        part[probe.reached] for part in (np.abs(probe.shares(less)), probe.errors(less, required))
+    )
     return EffectRow(
-        name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-        float(np.median(error)), _p95(error), int((error > required.tolerance).sum()), True,
+        name, float(share.mean()), _p95(share), float(np.median(error)), _p95(error),
+        int((error > required.tolerance).sum()), True,
     )  # fmt: skip
 
 

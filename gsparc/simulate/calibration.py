@@ -85,7 +85,7 @@ def used_materials(tracer: RayTracer) -> dict[str, Material]:
     }
 
 
-def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
+def apply_materials(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
     """Give the scene's surfaces these materials."""
     import drjit as dr
     import mitsuba as mi
@@ -133,7 +133,7 @@ class Replay:
 
         there, free = self.tracer.surfaces(), []
         for name, logarithms in materials.items():
-            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply`
+            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply_materials`
             for one in pair:
                 dr.enable_grad(one)
             there[name].relative_permittivity = 1 + dr.exp(pair[0])
@@ -144,7 +144,9 @@ class Replay:
         value, by_level = slopes(dr.detach(level).numpy().astype(np.float64))
         dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
         gradient = np.array([dr.grad(one).numpy()[0] for one in free], dtype=np.float64)
-        apply(self.tracer, {name: Material.of(pair) for name, pair in materials.items()})  # without gradients
+        apply_materials(
+            self.tracer, {name: Material.of(pair) for name, pair in materials.items()}
+        )  # without gradients
         lost = ~np.isfinite(gradient)
         if lost.any():
             log.warning(
@@ -203,7 +205,7 @@ def calibrate(
     """Find materials, one gain and the residuals' scale of largest posterior.
 
     Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
-    materials (`gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that
+    materials (`fit_gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that
     those that no path meets stay there. The replay's scene keeps the materials.
 
     Args:
@@ -214,7 +216,7 @@ def calibrate(
         steps: most evaluations; 0 learns gain and scale alone.
     """
     reached = traced > 0
-    gain, scale = gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
+    gain, scale = fit_gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
     if not steps:
         return Calibration(dict(start), gain, scale, 0)
     centre = np.concatenate([one.logarithms() for one in start.values()])
@@ -231,8 +233,8 @@ def calibrate(
             # Of largest likelihood gain and scale have no slope: that of the rest is the whole one.
             nonlocal gain, scale
             missed, by_level = measured_db[reached] - level[reached], np.zeros(len(level))
-            gain, scale = gain_and_scale(missed)
-            value, by_level[reached] = student(gain - missed, scale)
+            gain, scale = fit_gain_and_scale(missed)
+            value, by_level[reached] = student_loss(gain - missed, scale)
             return value, by_level
 
         value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
@@ -249,18 +251,18 @@ def calibrate(
     minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     _, x, gain, scale = best
     materials = {name: Material.of(pair) for name, pair in zip(start, x.reshape(-1, 2), strict=True)}
-    apply(replay.tracer, materials)
+    apply_materials(replay.tracer, materials)
     return Calibration(materials, gain, scale, spent)
 
 
-def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
+def fit_gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
     """Return location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
 
     Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at least
     `LEAST_DB`.
 
     >>> missed = np.array([2.0, 3.0, 3.0, 3.0, 4.0, 60.0])  # [dB], the last by a shadow
-    >>> bool(gain_and_scale(missed)[0] < missed.mean() / 3)
+    >>> bool(fit_gain_and_scale(missed)[0] < missed.mean() / 3)
     True
     """
     gain = float(np.median(missed))
@@ -273,10 +275,10 @@ def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
     return gain, scale
 
 
-def student(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
+def student_loss(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
     """Return the negative log likelihood of residuals (n,) but for a constant, and its slopes (n,).
 
-    >>> value, slopes = student(np.zeros(2), scale=1.0)
+    >>> value, slopes = student_loss(np.zeros(2), scale=1.0)
     >>> value, slopes.tolist()
     (0.0, [0.0, 0.0])
     """

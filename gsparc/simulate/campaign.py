@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.convergence import Convergence, convergence
+from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Changed, Decision
 from gsparc.simulate.effects import PropagationEffects
-from gsparc.simulate.scenes.build import build
+from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.survey import Survey
@@ -26,7 +25,7 @@ from gsparc.simulate.survey import Survey
 log = logging.getLogger(__name__)
 
 STAGES = ("build", "decide", "trace", "converge", "write")
-PARTS = 4  # version of what a shard holds: those of another are refused
+PARTS = 5  # version of what a shard holds: those of another are refused
 
 
 @dataclass(frozen=True)
@@ -60,13 +59,12 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
         raise ValueError(f"out={out} exists; remove it or choose another")
     # One more than there are stages: their differences are what each took.
     laps = [time.perf_counter()]
-    survey = build(campaign.scene, campaign.sampling)
+    survey = build_survey(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()})
     laps.append(time.perf_counter())
     effects, choice, changed, left_out = campaign.effects, None, None, deciding.NONE
     if isinstance(effects, AutoSettings):
-        decider = deciding.Decider(campaign, effects, survey)
-        decision = _decided(decider, shards)
+        decision = _decided(campaign, effects, survey, shards)
         effects, choice, changed = decision.effects, decision.choice, decision.changed
         if decision.samples is not None:
             campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
@@ -74,29 +72,30 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
             left_out = _decided_on(shards)  # these rows have more rays than the others
     effects = survey.engine.supported(effects)
     laps.append(time.perf_counter())
-    row_s = _trace_all(campaign, survey, effects, shards)
-    if choice is not None and decision.as_chosen and row_s:
-        choice = replace(choice, row_chosen=row_s)
+    _trace_all(campaign, survey, effects, shards)
     laps.append(time.perf_counter())
-    error = convergence(campaign, survey, effects, shards, left_out)
+    rows = join_shards(shards, len(survey))
+    error = measure_convergence(campaign, survey, effects, rows.arrays, left_out)
     laps.append(time.perf_counter())
     # Seconds of all but the shards, which keep their own over interruptions.
-    other_s = laps[1] - laps[0] + (0.0 if choice is None else choice.seconds) + laps[4] - laps[3]
-    dataset = assemble(campaign, survey, effects, choice, error, other_s, shards)
+    other_s = laps[1] - laps[0] + laps[4] - laps[3]
+    dataset = assemble(campaign, survey, effects, choice, error, other_s, shards, rows)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
     return Outcome(dataset, survey, effects, choice, changed, error, seconds)
 
 
-def _decided(decider: deciding.Decider, shards: Shards) -> Decision:
+def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
     """The decision of `auto`, taken once; what it traced is the first shard."""
     stored = shards.read_note()
     if stored is not None:
         return Decision.of(stored)
-    decision = decider.decide()
+    begin = time.perf_counter()
+    decision = deciding.Decider(campaign, settings, survey).decide()
     assert decision.rows is not None and decision.paths is not None
-    arrays = shard_arrays(decision.paths, decider.campaign, decider.survey.engine.wavelength)
-    shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: np.array(0.0)})  # they are in the decision's
+    arrays = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
+    seconds = np.array(time.perf_counter() - begin)
+    shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: seconds})
     shards.write_note(decision.note())
     return decision
 
@@ -109,38 +108,31 @@ class _Tracing:
     effects: PropagationEffects
     shards: Shards
     survey: Survey | None
-    compiled: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "survey": None}
 
-    def __call__(self, shard: tuple[int, np.ndarray]) -> float:
-        """CPU seconds of a row; NaN of a process's first shard, which compiles, or of one that is there."""
-        (number, rows), begin, busy = shard, time.perf_counter(), deciding.busy_s()
+    def __call__(self, shard: tuple[int, np.ndarray]) -> None:
+        (number, rows), begin = shard, time.perf_counter()
         if self.shards.path(number).exists():
-            return math.nan
+            return
         if self.survey is None:
-            self.survey = build(self.campaign.scene, self.campaign.sampling)
+            self.survey = build_survey(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.effects)
-        spent = (deciding.busy_s() - busy) / len(rows)
         arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
         self.shards.put(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
-        first, self.compiled = not self.compiled, True
-        return math.nan if first else spent
 
 
-def _trace_all(
-    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards
-) -> float | None:
-    """Trace what is missing; CPU seconds of a row, once compiled, None where too few were traced."""
+def _trace_all(campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards) -> None:
+    """Trace what is missing."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
         log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))
     work = _Tracing(campaign, effects, shards, survey)
-    spent = [row_s for _, row_s in each(work, missing, "shards", cost=lambda shard: len(shard[1]))]
-    return float(np.nanmean(spent)) if np.isfinite(spent).any() else None
+    for _ in run_each(work, missing, "shards", cost=lambda shard: len(shard[1])):
+        pass
 
 
 def _decided_on(shards: Shards) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,6 @@ from skimage.metrics import structural_similarity
 
 from gsparc.simulate.effects import PropagationEffects
 from gsparc.simulate.settings import Campaign
-from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
 from gsparc.simulate.survey import Survey
 
@@ -39,12 +39,19 @@ class Convergence:
         return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
-def convergence(
-    campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards, left_out: np.ndarray
+def measure_convergence(
+    campaign: Campaign,
+    survey: Survey,
+    effects: PropagationEffects,
+    traced: Mapping[str, np.ndarray],
+    left_out: np.ndarray,
 ) -> Convergence | None:
     """Compare rows of a file with a second seed's; None where none is asked for, or without rays.
 
-    Rows `left_out` (n,) were traced otherwise.
+    Args:
+        campaign, survey, effects: of the file.
+        traced: its arrays, a row for each of the survey's.
+        left_out: (n,) rows that were traced otherwise.
     """
     count = min(campaign.check, int(CHECKED * len(survey)))
     if count == 0 or not survey.engine.random:
@@ -53,7 +60,7 @@ def convergence(
     rows = survey.spread(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
     again = survey.trace(rows, effects, campaign.sampling.seed + 1)
-    csi, spectrum, power = shards.of_rows(rows, "csi", "spectrum", "received_power")
+    csi, spectrum, power = (traced[name][rows] for name in ("csi", "spectrum", "received_power"))
     frequency, wavelength = campaign.scene.frequency_hz, survey.engine.wavelength
     other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)
     energy = max(float((np.abs(csi) ** 2).sum()), np.finfo(float).tiny)

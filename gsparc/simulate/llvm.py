@@ -49,7 +49,7 @@ class SimulatorMissing(RuntimeError):
     """Sionna or its LLVM library is missing or broken; the message holds the remedy."""
 
 
-def candidates() -> list[Path]:
+def find_libraries() -> list[Path]:
     """Return libraries to try, best first: the one the user names (then no other), ours, the system's."""
     if named := os.environ.get(VARIABLE):
         return [Path(named)]
@@ -58,7 +58,7 @@ def candidates() -> list[Path]:
 
 
 @lru_cache
-def fault(library: Path) -> str | None:
+def library_fault(library: Path) -> str | None:
     """Return what is wrong with a library, in words; None when a tiny solve works with it.
 
     The solve runs in a subprocess, because a wrong LLVM ends the process that loads it.
@@ -94,7 +94,7 @@ def _seal(library: Path) -> Path:
     return platform_cache() / "llvm" / sha256(repr(parts).encode()).hexdigest()[:32]
 
 
-def prepare(fetch_missing: bool = False) -> Path:
+def prepare_llvm(fetch_missing: bool = False) -> Path:
     """Make sure that `import sionna.rt` will work in this process, and return the library it will use.
 
     Raises:
@@ -103,21 +103,21 @@ def prepare(fetch_missing: bool = False) -> Path:
     if importlib.util.find_spec("sionna") is None or importlib.util.find_spec("sionna.rt") is None:
         raise SimulatorMissing("Sionna is not installed; run `make sionna` or pip install 'gsparc[sionna]'")
     faults = []
-    for library in candidates():
-        wrong = fault(library)
+    for library in find_libraries():
+        wrong = library_fault(library)
         if wrong is None:
             os.environ[VARIABLE] = str(library)
             return library
         faults.append(f"{library}: {wrong}")
     # A library that the user names is tried alone: another would hide that it is wrong.
     if fetch_missing and not os.environ.get(VARIABLE):
-        fetch()
-        return prepare()
+        fetch_llvm()
+        return prepare_llvm()
     causes = "; ".join(faults) or "no LLVM library was found"
     raise SimulatorMissing(f"Sionna needs LLVM 19 (15 and 16 abort): {causes}; {REMEDY}")
 
 
-def fetch() -> None:
+def fetch_llvm() -> None:
     """Unpack Debian's package below the environment's prefix without root.
 
     Raises:
@@ -134,6 +134,6 @@ def fetch() -> None:
 
 if __name__ == "__main__":
     try:
-        sys.stdout.write(f"LLVM for Sionna: {prepare(fetch_missing=True)}\n")
+        sys.stdout.write(f"LLVM for Sionna: {prepare_llvm(fetch_missing=True)}\n")
     except SimulatorMissing as error:
         sys.exit(f"error: {error}")

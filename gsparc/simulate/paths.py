@@ -43,7 +43,7 @@ class Paths:
         """Sort paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
         # The last key counts most: by receiver, then by delay.
         rank = np.lexsort((delay, owner))
-        offsets = starts(np.bincount(owner, minlength=receivers))
+        offsets = group_offsets(np.bincount(owner, minlength=receivers))
         return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
 
     def __len__(self) -> int:
@@ -62,15 +62,15 @@ class Paths:
     def select(self, selected: np.ndarray) -> Paths:
         """Return only the paths where `selected` (P,) bool is true; receivers stay."""
         counts = np.bincount(self.owner[selected], minlength=len(self))
-        return Paths(starts(counts), *(getattr(self, name)[selected] for name in ARRAYS))
+        return Paths(group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS))
 
     def take(self, receivers: np.ndarray) -> Paths:
         """Return receivers (n,) alone, in this order."""
         counts = np.diff(self.offsets)[receivers]
         # Rows of all paths without a loop: where a group begins here, less where it will begin.
-        first = np.repeat(self.offsets[receivers] - starts(counts)[:-1], counts)
+        first = np.repeat(self.offsets[receivers] - group_offsets(counts)[:-1], counts)
         rows = first + np.arange(counts.sum())
-        return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
+        return Paths(group_offsets(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
     def under(self, effects: PropagationEffects) -> Paths:
         """Return what remains of a full simulation under these switches."""
@@ -116,18 +116,18 @@ class Paths:
 ARRAYS = ("gain", "delay", "direction", "mechanisms", "order")
 
 
-def starts(counts: np.ndarray) -> np.ndarray:
+def group_offsets(counts: np.ndarray) -> np.ndarray:
     """Return offsets (R + 1,) of consecutive groups of `counts` (R,) paths.
 
-    >>> starts(np.array([2, 0, 1]))
+    >>> group_offsets(np.array([2, 0, 1]))
     array([0, 2, 2, 3])
     """
     return np.concatenate([[0], np.cumsum(counts)])
 
 
-def join(parts: Sequence[Paths]) -> Paths:
+def join_receivers(parts: Sequence[Paths]) -> Paths:
     """Return receivers of all parts, one after the other."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
     return Paths(
-        starts(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
+        group_offsets(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
     )

@@ -22,8 +22,8 @@ import torch
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, PropagationEffects
-from gsparc.simulate.paths import Paths, join
-from gsparc.simulate.scenes.shipped import shipped
+from gsparc.simulate.paths import Paths, join_receivers
+from gsparc.simulate.scenes.shipped import list_shipped_scenes
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
 from gsparc.simulate.survey import Engine
@@ -94,7 +94,7 @@ class RayTracer(Engine):
         scattering: float | None = None,
         antenna: Antenna = ISOTROPIC,
     ) -> None:
-        llvm.prepare()
+        llvm.prepare_llvm()
         import drjit as dr
 
         dr.set_thread_count(torch.get_num_threads())  # of one thread alone the bits come again
@@ -152,14 +152,14 @@ class RayTracer(Engine):
         # How many receivers a call has is a constant of its kernels: any other number compiles them anew.
         beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
         parts, first = [], 0
-        for count, size in calls(len(receivers), self.sampling.batch):
+        for count, size in divide_into_calls(len(receivers), self.sampling.batch):
             filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
             solved = self.solutions(filled, effects, seed)
             ports = 2 if effects.polarisation else 1
-            part = join([_collect(solution, number, ports) for solution, number in solved])
+            part = join_receivers([_collect(solution, number, ports) for solution, number in solved])
             parts.append(part.take(np.arange(count)))
             first += count
-        return join(parts)
+        return join_receivers(parts)
 
     def solutions(
         self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None
@@ -361,7 +361,7 @@ def _lattice(points: int) -> Any:
     return lattice
 
 
-def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
+def divide_into_calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     """Divide receivers into calls, each filled up to a batch, a third of one; of few a ninth ..."""
     size, whole = Sampling(batch=batch).part, receivers // batch if receivers > batch else 0
     while size > 1 and math.ceil(size / 3) >= receivers:
@@ -430,7 +430,7 @@ def _load_file(source: str | Path) -> Any:
         except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
             first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
-    known = shipped()
+    known = list_shipped_scenes()
     if source not in known:
         raise ValueError(f"scene.builtin={source}: Sionna has no such scene; there are {', '.join(known)}")
     return rt.load_scene(getattr(rt.scene, str(source)))

@@ -9,36 +9,33 @@ from rich.table import Table
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
 
-STATED = ("deliverable", "probes", "samples", "row_all", "row_chosen", "saved")
+STATED = ("deliverable", "probes", "samples")
 
 
 def choice_table(choice: Choice) -> Table:
     """Return a row per effect: its share of power, errors without it, its cost, kept or dropped."""
-    table = Table(title=f"requirement: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
+    table = Table(
+        title=f"requirement: {choice.deliverable}", caption=describe_choice(choice), caption_justify="left"
+    )
     table.add_column("left out")
-    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "probes off"):
+    for name in ("power %", "p95", "error", "p95", "probes off"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in choice.table:
         table.add_row(
             row.effect.replace("_", " "),
-            f"{row.share:.1%}", f"{row.share_p95:.1%}", f"{row.nmse:.2g}", f"{row.nmse_p95:.2g}",
-            f"{row.error:.2g}", f"{row.error_p95:.2g}", str(row.failures),
+            f"{row.share:.1%}", f"{row.share_p95:.1%}", f"{row.error:.2g}", f"{row.error_p95:.2g}",
+            str(row.failures),
             "kept" if row.kept else "dropped",
             style="bold" if row.kept else None,
         )  # fmt: skip
     return table
 
 
-def verdict(choice: Choice) -> str:
-    """Return what was chosen, what it saves, and whether the requirement is met on held-back receivers."""
+def describe_choice(choice: Choice) -> str:
+    """Return what was chosen, and whether the requirement is met on held-back receivers."""
     chosen = f"needed: {choice.effects}"
     chosen += "" if choice.samples is None else f", {choice.samples:,} rays"
-    if choice.saved is not None and choice.row_chosen and choice.row_all:
-        chosen += (
-            f"; a receiver takes {choice.row_chosen * 1e3:.0f} CPU ms instead of {choice.row_all * 1e3:.0f} "
-            f"({choice.saved:.0%} saved)"
-        )
     checked = choice.verdict
     if checked is None:
         return chosen
@@ -49,7 +46,7 @@ def verdict(choice: Choice) -> str:
     )
 
 
-def figures(outcome: Outcome) -> dict[str, Any]:
+def summary_facts(outcome: Outcome) -> dict[str, Any]:
     """Return flat facts."""
     dataset = outcome.dataset
     facts: dict[str, Any] = {
@@ -68,17 +65,17 @@ def figures(outcome: Outcome) -> dict[str, Any]:
         facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
     choice = outcome.choice
     if choice is not None:
-        facts |= {"auto/decide_s": choice.seconds, **{f"auto/{k}": getattr(choice, k) for k in STATED}}
+        facts |= {f"auto/{k}": getattr(choice, k) for k in STATED}
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")
-            for k in ("share", "nmse", "nmse_p95", "error_p95", "failures", "kept"):
+            for k in ("share", "error_p95", "failures", "kept"):
                 facts[f"auto/{name}/{k}"] = getattr(row, k)
         if choice.verdict is not None:
             facts |= {f"auto/verdict/{k}": v for k, v in vars(choice.verdict).items()}
     return facts
 
 
-def closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
+def closing_sentences(outcome: Outcome, seconds: float, load: float) -> list[str]:
     """Return what a simulation took, and how far two seeds of it are apart, in sentences."""
     count = len(outcome.survey)
     lines = [

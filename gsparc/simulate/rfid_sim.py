@@ -17,13 +17,13 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.datamodule import DataModule
-from gsparc.data.datasets.campaign import made_once, simulated, write_split
+from gsparc.data.datasets.campaign import load_stand_in, make_once, write_split
 from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
-from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox import Room, trace_room
 
 GATEWAY = np.array([5.0, 0.26, 0.0])  # [m], as in the release
 ORIENTATION = np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])  # (x, y, z, w), as in the release
@@ -66,7 +66,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     """Write `count` spectra in the release's layout; the folder must not exist."""
     positions = hand_moved(count, seed)
     array, frequency = planar_array() @ Rotation.from_quat(ORIENTATION).as_matrix().T, LIGHT / WAVELENGTH
-    vectors = trace(
+    vectors = trace_room(
         ROOM, positions, GATEWAY, frequency, max_order=MAX_ORDER, array=array, snr_db=SNR_DB, seed=seed
     ).csi[:, :, 0]
     with whole_folder(folder) as partial:
@@ -107,7 +107,7 @@ class RFIDStandIn:
         if count < 2:
             raise ValueError(f"dataset.count={count}: expected at least 2 tag positions")
         where = Path(self.root) / f"{STAND_IN}-{count}-{seed}"
-        return made_once(where, lambda folder: write_rfid_sim(folder, count, seed))
+        return make_once(where, lambda folder: write_rfid_sim(folder, count, seed))
 
 
 class RFIDSim(DataModule):
@@ -119,4 +119,4 @@ class RFIDSim(DataModule):
 
     def load(self) -> Measurements:
         """Simulate when it is not there yet, then read it like the release."""
-        return simulated(self.stand_in, "RFID", load_rfid)
+        return load_stand_in(self.stand_in, "RFID", load_rfid)

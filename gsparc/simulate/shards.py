@@ -78,21 +78,6 @@ class Shards:
         with np.load(self.path(number), allow_pickle=False) as file:
             return {name: file[name] for name in names or file.files}
 
-    def of_rows(self, rows: np.ndarray, *names: str) -> list[np.ndarray]:
-        """Return arrays of `names` (n, ...) at rows (n,), all in finished shards; no others are kept."""
-        parts = []
-        for number in self.numbers():
-            stored = self.get(number, ROWS)[ROWS]
-            mine = np.flatnonzero(np.isin(stored, rows))
-            if len(mine):
-                shard = self.get(number, *names)
-                parts.append((stored[mine], *(shard[name][mine] for name in names)))
-        stored, *arrays = (np.concatenate(one) for one in zip(*parts, strict=True))
-        # From the order of shards to the order asked for.
-        at = np.argsort(stored)
-        at = at[np.searchsorted(stored[at], rows)]
-        return [one[at] for one in arrays]
-
     def remove(self) -> None:
         """Remove everything, after the dataset is written."""
         # Renamed first: a kill amid the removal would leave shards without the plan that they belong to.

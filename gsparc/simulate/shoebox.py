@@ -90,10 +90,10 @@ class Images:
         return points[..., None, :] * self.signs + self.offsets
 
 
-def images(room: Room, max_order: int) -> Images:
+def mirror_images(room: Room, max_order: int) -> Images:
     """Return all images of order <= `max_order`, sorted by order; the first is the point itself.
 
-    >>> images(Room.uniform((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # the point, and one in each wall
+    >>> mirror_images(Room.uniform((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # itself, one in each wall
     [0, 1, 1, 1, 1, 1, 1]
     """
     reach = range(-max_order, max_order + 1)
@@ -117,7 +117,7 @@ def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(even, 1.0, -1.0), np.where(even, 0.0, 2.0 * room.lower + size) + cell * size
 
 
-def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
+def visible_images(room: Room, images: Images, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
     """Tell whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
@@ -136,11 +136,11 @@ def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray
         for low, high in room.occluders:
             corner, other = signs * low + offsets, signs * high + offsets
             for box_low, box_high in zip(np.minimum(corner, other), np.maximum(corner, other), strict=True):
-                seen[:, i] &= ~meets(observer, places[:, i], box_low, box_high)
+                seen[:, i] &= ~segments_meet_box(observer, places[:, i], box_low, box_high)
     return seen
 
 
-def meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def segments_meet_box(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Tell whether segments start -> end (S, D) meet the box from low to high (D,): (S,) bool; slab test."""
     along = end - start
     parallel = along == 0
@@ -178,7 +178,7 @@ class Trace:
     noise_variance: float
 
 
-def trace(
+def trace_room(
     room: Room,
     tx: np.ndarray,
     rx: np.ndarray,
@@ -192,7 +192,8 @@ def trace(
     """Compute channels of all rows: `sum_i v_i g_i exp(-j 2 pi f d_i / c) wavelength / (4 pi d_i)`.
 
     >>> room, tones = Room.uniform((6.0, 4.0, 3.0)), np.array([2.40e9, 2.41e9])
-    >>> trace(room, np.array([1.0, 1.0, 1.0]), np.array([[5.0, 3.0, 1.0], [2.0, 1.0, 1.0]]), tones).csi.shape
+    >>> places = np.array([[5.0, 3.0, 1.0], [2.0, 1.0, 1.0]])
+    >>> trace_room(room, np.array([1.0, 1.0, 1.0]), places, tones).csi.shape
     (2, 1, 2)
 
     Args:
@@ -213,8 +214,8 @@ def trace(
             raise ValueError(f"{name}, {row}: outside the room or inside an occluder")
     frequency = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
     elements = np.zeros((1, 3)) if array is None else np.asarray(array, dtype=np.float64)
-    mirrored = images(room, max_order)
-    seen = visible(room, mirrored, tx, rx)
+    mirrored = mirror_images(room, max_order)
+    seen = visible_images(room, mirrored, tx, rx)
     amplitude = mirrored.gain * seen
     csi = np.empty((len(tx), len(elements), len(frequency)), dtype=np.complex128)
     sources = mirrored.of(tx)
@@ -258,8 +259,8 @@ class ShoeboxEngine(Engine):
 
     def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
         """Trace paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
-        mirrored = images(self.room, effects.depth)
-        seen = visible(self.room, mirrored, self.transmitter[None], receivers)
+        mirrored = mirror_images(self.room, effects.depth)
+        seen = visible_images(self.room, mirrored, self.transmitter[None], receivers)
         if not effects.line_of_sight:
             seen[:, mirrored.order == 0] = False
         owner, image = np.nonzero(seen)

@@ -15,7 +15,7 @@ from itertools import pairwise, permutations
 import numpy as np
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.shoebox import meets
+from gsparc.simulate.shoebox import segments_meet_box
 
 SHRINK = 1e-6  # [m]; a reflection point on a wall does not lie inside the building
 STRONGEST = 64  # paths of a user
@@ -53,7 +53,7 @@ class Streets:
         """Tell whether a building stands between points a and b (S, 2) [m]: (S,) bool."""
         hit = np.zeros(len(a), dtype=bool)
         for low, high in self.buildings:
-            hit |= meets(a, b, low + SHRINK, high - SHRINK)
+            hit |= segments_meet_box(a, b, low + SHRINK, high - SHRINK)
         return hit
 
     def open(self, points: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ class _Route:
     gain: np.ndarray
 
 
-def trace(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
+def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
     """Trace paths from the base to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
     routes = list(_routes(streets, users, wavelength))
     gain = np.zeros((len(users), 2 * len(routes)), complex)

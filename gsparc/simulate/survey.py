@@ -10,8 +10,8 @@ import numpy as np
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.effects import PropagationEffects
-from gsparc.simulate.paths import Paths, join
-from gsparc.simulate.scenes.receivers import spread
+from gsparc.simulate.paths import Paths, join_receivers
+from gsparc.simulate.scenes.receivers import farthest_points
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Survey:
 
     def spread(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
-        order, turns = spread(self.places, min(count, len(self.places)), seed), len(self.engines)
+        order, turns = farthest_points(self.places, min(count, len(self.places)), seed), len(self.engines)
         # Place i with transmitter i, then every place with the next one: all have their turn.
         rounds = [
             order + (np.arange(len(order)) + shift) % turns * len(self.places) for shift in range(turns)
@@ -76,7 +76,7 @@ class Survey:
         parts = [
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
-        return join(parts).take(np.argsort(order, kind="stable"))
+        return join_receivers(parts).take(np.argsort(order, kind="stable"))
 
 
 class Engine(Protocol):

@@ -47,8 +47,8 @@ class RayLauncher(Launcher):
 
         # Workers take over this process's number of threads, and count as so many cores.
         torch.set_num_threads(jobs[0].get("threads") or 1)
-        executor.use(executor.Engine("ray", self.workers, self.address))
-        found = dict(executor.each(done, jobs, "jobs"))
+        executor.use_engine(executor.Engine("ray", self.workers, self.address))
+        found = dict(executor.run_each(done, jobs, "jobs"))
         return [found[number] for number in range(len(jobs))]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from releases import SPOILT
 
-from gsparc.data.datasets.newrf import raw_of_newrf
+from gsparc.data.datasets.newrf import read_newrf
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.load import load
@@ -224,7 +224,7 @@ def test_newrf_without(tmp_path, csi_arrays, refused, name):
     assert len(load({"name": "newrf", "file": str(tmp_path / "room.npz")})) == 12
     del arrays[name]
     (tmp_path / "room.npz").write_bytes(_archive(arrays))
-    refused(rf"room\.npz, {name}: missing", raw_of_newrf, tmp_path / "room.npz")
+    refused(rf"room\.npz, {name}: missing", read_newrf, tmp_path / "room.npz")
 
 
 def test_many_bad_rows_stay_readable():

@@ -13,7 +13,7 @@ from releases import write_release
 
 from gsparc.data import blocks, raw
 from gsparc.data.assemble import content_hash
-from gsparc.data.conventions import mended
+from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own, write_own
@@ -55,7 +55,7 @@ def test_tones_that_are_zero_in_a_block_alone_were_not_measured_there(small):
     values[:4, :, 2], values[:, :, 5] = 0, 0
     site = Site("room", "csi", "rx", None, None, None, arrays()["frequency_hz"])
     data = Measurements(site, none, none, np.zeros((40, 3, 3)), values)
-    mask = mended(data, ["zeros_unmeasured"]).mask
+    mask = convert_conventions(data, ["zeros_unmeasured"]).mask
     assert mask[:, :, 2].all() and not mask[:, :, 5].any()
 
 
@@ -101,8 +101,8 @@ def test_the_hash_is_that_of_all_bytes_as_it_was(small):
 
 def test_blocks_are_all_rows_in_their_order(small):
     values = np.arange(700.0).reshape(70, 10)
-    assert np.array_equal(np.concatenate([values[part] for part in blocks.blocks(values)]), values)
-    assert len(list(blocks.blocks(np.zeros((0, 3))))) == 1
+    assert np.array_equal(np.concatenate([values[part] for part in blocks.row_blocks(values)]), values)
+    assert len(list(blocks.row_blocks(np.zeros((0, 3))))) == 1
 
 
 def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_path, small, monkeypatch):
@@ -121,11 +121,11 @@ def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_pat
 
 def test_a_process_that_is_started_opens_the_file_itself(tmp_path):
     """It got a copy of the targets through a pipe: of 100,000 channels 0.8 GB a process."""
-    nameless = blocks.scratch((3, 2), np.int16)
+    nameless = blocks.allocate_on_disk((3, 2), np.int16)
     nameless[:] = np.arange(6).reshape(3, 2)
     with h5py.File(tmp_path / "own.h5", "w") as file:
         file["csi"] = np.arange(5.0)
-        named = blocks.on_disk(file["csi"])
+        named = blocks.map_from_disk(file["csi"])
     spawn = multiprocessing.get_context("spawn")
     arrays = (nameless, named, named[1:3])
     process = spawn.Process(target=say, args=(tmp_path / "said", *arrays))
@@ -160,7 +160,9 @@ def test_an_array_that_was_never_written_filled_the_disk(
     tmp_path, monkeypatch, refused, rows, more, says, name
 ):
     """A file of 7 kB: 73 GB in 8 s, until other programs died."""
-    monkeypatch.setattr(blocks, "scratch", lambda *unused: pytest.fail("written before it was refused"))
+    monkeypatch.setattr(
+        blocks, "allocate_on_disk", lambda *unused: pytest.fail("written before it was refused")
+    )
     monkeypatch.setattr(
         h5py.Dataset, "__getitem__", lambda *unused: pytest.fail("read before it was refused")
     )
@@ -175,8 +177,8 @@ def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch,
     refused("csi: shape .* no other array has .262144,. rows", load_own, tmp_path / "own.npz")
     zeros |= {"rx_position": np.zeros((2**18, 3))}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
-    monkeypatch.setattr(raw, "memory", lambda: 2**27)
-    refused("csi: .* too little memory for 90,", load_own, tmp_path / "own.npz")
+    monkeypatch.setattr(raw, "machine_memory", lambda: 2**27)
+    refused("csi: .* too little machine_memory for 90,", load_own, tmp_path / "own.npz")
     with zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive, archive.open("csi.npy", "w") as entry:
         head = {"descr": "<c8", "fortran_order": False, "shape": (10**15,)}
         np.lib.format.write_array_header_1_0(entry, head)

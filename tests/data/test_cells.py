@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gsparc.data.datasets.own import Own, raw_of_own
+from gsparc.data.datasets.own import Own, read_own
 from gsparc.data.errors import DataError
 from gsparc.data.limits import SettingError
 
@@ -35,7 +35,7 @@ def parts(frame: pd.DataFrame, folder, count: int):
 
 @pytest.mark.parametrize("count", [1, 7])
 def test_cells_are_the_means_of_all_rows(frame, tmp_path, count):
-    raw = raw_of_own(parts(frame, tmp_path / "rows", count), cell_m=CELL_M)
+    raw = read_own(parts(frame, tmp_path / "rows", count), cell_m=CELL_M)
     frame["heard"] = frame["rssi [dBm]"].notna()
     cell = [np.floor(frame[axis] / CELL_M).rename(f"of {axis}") for axis in "xyz"]
     whole = frame.groupby([*cell, "station", "heard"], sort=False).mean(numeric_only=True)
@@ -60,7 +60,7 @@ def test_degrees_are_cells_of_metres(tmp_path):
     latitude, longitude = 60.0 + np.arange(64) * 2.5 / 111_320, 10 + np.arange(64) * 2.5 / 111_320 * 2
     rows = {"latitude": np.repeat(latitude, 64), "longitude": np.tile(longitude, 64)}
     pd.DataFrame({**rows, "rssi_db": -70.0}).to_parquet(tmp_path / "rows.parquet")
-    cells = len(raw_of_own(tmp_path / "rows.parquet", cell_m=5.0).arrays["rssi_db"])
+    cells = len(read_own(tmp_path / "rows.parquet", cell_m=5.0).arrays["rssi_db"])
     assert abs(cells - 32 * 32) <= 2 * 32 + 1  # a border may be cut
 
 
@@ -80,8 +80,8 @@ def test_what_cannot_be_is_refused(frame, tmp_path, change, cell_m, said):
 
 PEAK = """
 import resource, sys
-from gsparc.data.datasets.own import raw_of_own
-raw_of_own(sys.argv[1], cell_m=5.0)
+from gsparc.data.datasets.own import read_own
+read_own(sys.argv[1], cell_m=5.0)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
 """
 

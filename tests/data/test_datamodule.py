@@ -7,7 +7,14 @@ import torch
 from campaigns import compose
 
 import gsparc.conf
-from gsparc.data.datamodule import DataModule, Loaded, StepLoader, order, share, steps_per_epoch
+from gsparc.data.datamodule import (
+    DataModule,
+    Loaded,
+    StepLoader,
+    rows_of_device,
+    rows_of_step,
+    steps_per_epoch,
+)
 from gsparc.data.load import datamodule
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
@@ -25,17 +32,17 @@ def test_order_shows_every_row_once_an_epoch():
     pool = np.array([3, 5, 8, 13, 21, 34, 55])
     assert steps_per_epoch(7, 3) == 3
     for epoch in range(3):
-        rows = np.concatenate([order(1, 3 * epoch + i, 3, pool) for i in range(3)])
+        rows = np.concatenate([rows_of_step(1, 3 * epoch + i, 3, pool) for i in range(3)])
         np.testing.assert_array_equal(np.sort(rows), pool)
-    assert not np.array_equal(order(1, 0, 7, pool), order(1, 1, 7, pool))
-    assert not np.array_equal(order(1, 0, 7, pool), order(2, 0, 7, pool))
-    np.testing.assert_array_equal(order(1, 41, 3, pool), order(1, 41, 3, pool))
+    assert not np.array_equal(rows_of_step(1, 0, 7, pool), rows_of_step(1, 1, 7, pool))
+    assert not np.array_equal(rows_of_step(1, 0, 7, pool), rows_of_step(2, 0, 7, pool))
+    np.testing.assert_array_equal(rows_of_step(1, 41, 3, pool), rows_of_step(1, 41, 3, pool))
 
 
 def test_order_is_pinned():
     """A change here breaks the resuming of every stored run."""
-    assert order(0, 0, 4, np.arange(8)).tolist() == [2, 4, 3, 6]
-    assert order(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
+    assert rows_of_step(0, 0, 4, np.arange(8)).tolist() == [2, 4, 3, 6]
+    assert rows_of_step(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
 
 
 def test_empty_pool_is_refused(data):
@@ -76,7 +83,7 @@ def _fit(module, tmp_path, model, steps, ckpt=None, every=None):
 def test_resume_in_the_middle_of_an_epoch_continues_exactly(data, tmp_path):
     whole, module = _Recorder(), Loaded(data, 4).use(FOLD, seed=7)
     _fit(module, tmp_path, whole, steps=10, every=1)
-    assert whole.seen == [order(7, s, 4, FOLD.train).tolist() for s in range(10)]
+    assert whole.seen == [rows_of_step(7, s, 4, FOLD.train).tolist() for s in range(10)]
     for step in (1, 2, 3, 4, 5, 7):
         resumed = _Recorder()
         _fit(module, tmp_path, resumed, steps=10, ckpt=tmp_path / f"step={step}.ckpt")
@@ -150,13 +157,13 @@ def test_a_subclass_needs_load_alone(csi_arrays, tmp_path):
         module.train_dataloader()
     recorder = _Recorder()
     _fit(module.use(FOLD, seed=3), tmp_path, recorder, steps=2)
-    assert recorder.seen == [order(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
+    assert recorder.seen == [rows_of_step(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
     assert [b.index.tolist() for b in module.test_dataloader()] == [FOLD.test.tolist()]
 
 
 @pytest.mark.parametrize(("rows", "devices"), [(8, 2), (5, 2), (1, 3), (2, 3)])
 def test_devices_share_every_batch_and_none_is_left_out(rows, devices):
-    shares = [share(np.arange(rows), rank, devices) for rank in range(devices)]
+    shares = [rows_of_device(np.arange(rows), rank, devices) for rank in range(devices)]
     assert all(len(part) for part in shares)
     assert set(np.concatenate(shares)) == set(range(rows))
     if rows >= devices:

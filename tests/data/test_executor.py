@@ -15,7 +15,7 @@ import pytest
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from gsparc.data import executor
-from gsparc.data.executor import Engine, each
+from gsparc.data.executor import Engine, run_each
 from gsparc.data.limits import SettingError
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -44,14 +44,14 @@ class Stored:
 
 
 def test_here_pieces_are_done_in_order_and_what_is_not_wanted_is_left_out(tmp_path):
-    found = list(each(Stored(tmp_path), range(COUNT), wanted=lambda piece: piece % 3 > 0))
+    found = list(run_each(Stored(tmp_path), range(COUNT), wanted=lambda piece: piece % 3 > 0))
     assert found == [(n, n * n) for n in range(COUNT) if n % 3]
     assert {int(file.read_text()) for file in tmp_path.glob("*.begun")} == {os.getpid()}
 
 
 def test_threads_of_this_process_do_pieces_side_by_side():
     began = time.perf_counter()
-    found = list(each(lambda piece: time.sleep(0.1) or piece, range(6), threads=3))
+    found = list(run_each(lambda piece: time.sleep(0.1) or piece, range(6), threads=3))
     assert sorted(found) == [(n, n) for n in range(6)] and time.perf_counter() - began < 0.5
 
 
@@ -59,14 +59,14 @@ def test_one_line_says_how_many_are_left_and_how_long(caplog, monkeypatch):
     monkeypatch.setattr(executor, "SAY_S", 0.0)
     monkeypatch.setattr(executor, "LINES", 100)
     caplog.set_level(logging.INFO, "gsparc")
-    list(each(lambda piece: time.sleep(piece / 10), [1, 3], "cells", cost=float))
+    list(run_each(lambda piece: time.sleep(piece / 10), [1, 3], "cells", cost=float))
     assert caplog.messages in (["1 of 2 cells, about 0 s left"], ["1 of 2 cells, about 1 s left"])
 
 
 def test_an_error_ends_the_work_here():
     seen = []
     with pytest.raises(ZeroDivisionError):
-        list(each(lambda piece: seen.append(piece) or 1 // piece, [2, 1, 0, 5]))
+        list(run_each(lambda piece: seen.append(piece) or 1 // piece, [2, 1, 0, 5]))
     assert seen == [2, 1, 0]
 
 
@@ -75,21 +75,21 @@ def test_settings_that_cannot_be_are_refused(monkeypatch):
         Engine("dask")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(SettingError, match=r"pip install 'gsparc\[ray\]'"):
-        executor.use(Engine("ray"))
+        executor.use_engine(Engine("ray"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES[1:])
 def test_a_piece_whose_process_dies_is_begun_again_and_no_stored_one(tmp_path, engine, elsewhere):
     elsewhere(engine)
-    found = dict(each(Stored(tmp_path, killed=4), range(COUNT)))
+    found = dict(run_each(Stored(tmp_path, killed=4), range(COUNT)))
     assert found == {n: n * n for n in range(COUNT)}
     begun = {int(file.stem): file.read_text().split() for file in tmp_path.glob("*.begun")}
     assert len(begun[4]) == 2 and len(set().union(*begun.values())) > 1
     assert sum(map(len, begun.values())) <= COUNT + 2  # joblib ends the other process, too
     assert str(os.getpid()) not in set().union(*begun.values())
     before = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.npy")}
-    assert dict(each(Stored(tmp_path), range(COUNT))) == found
+    assert dict(run_each(Stored(tmp_path), range(COUNT))) == found
     assert before == {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.npy")}
 
 
@@ -98,7 +98,7 @@ def test_a_piece_whose_process_dies_is_begun_again_and_no_stored_one(tmp_path, e
 def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, elsewhere):
     elsewhere(engine)
     with pytest.raises(Exception) as raised:
-        list(each(Stored(tmp_path, killed=2, always=True), range(4)))
+        list(run_each(Stored(tmp_path, killed=2, always=True), range(4)))
     assert isinstance(raised.value, BrokenProcessPool) or type(raised.value).__module__.startswith("ray.")
     assert all((tmp_path / f"{n}.npy").exists() for n in (0, 1))
     tried = (tmp_path / "2.begun").read_text().split()
@@ -109,10 +109,10 @@ def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, el
 @pytest.mark.parametrize("engine", ENGINES[1:])
 def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewhere):
     elsewhere(engine)
-    list(each(abs, [1, 2]))  # workers are there
+    list(run_each(abs, [1, 2]))  # workers are there
     began = time.perf_counter()
     with pytest.raises(ZeroDivisionError, match=r"^integer division or modulo by zero$"):
-        list(each(lambda piece: 1 // piece if piece < 2 else time.sleep(60), [0, 2, 3, 4]))
+        list(run_each(lambda piece: 1 // piece if piece < 2 else time.sleep(60), [0, 2, 3, 4]))
     assert time.perf_counter() - began < 10
 
 
@@ -121,7 +121,7 @@ def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewh
 def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
     cluster = elsewhere("ray", nodes=nodes)
     found, lost = {}, None
-    for number, value in each(Stored(tmp_path), range(4 * COUNT)):
+    for number, value in run_each(Stored(tmp_path), range(4 * COUNT)):
         found[number] = value
         if len(found) == COUNT:
             lost = cluster.list_all_nodes()[-1]
@@ -175,7 +175,7 @@ def test_threads_ended_in_compiled_code_at_an_interrupt():
         ended.append(piece)
 
     with pytest.raises(KeyboardInterrupt):
-        for _ in each(work, range(8), threads=2):
+        for _ in run_each(work, range(8), threads=2):
             raise KeyboardInterrupt
     assert len(ended) <= 4  # those begun, and no others
     before = list(ended)

@@ -50,6 +50,7 @@ def test_a_list_of_sites_is_read_whole(tmp_path):
     np.testing.assert_allclose(stations.position + reading.data.site.origin, one.place[number], atol=0.06)
     assert set(stations.carrier_hz) == {1815e6, 806e6} and set(stations.sector[:, 4]) == {43}
     assert stations.sector[:, 5].tolist() == [i // 3 for i in number]
+    assert list(stations.label) == [f"S{i // 3}_{i % 3}" for i in number]
     unread = [note for note in reading.notes if "not read: column 'Vendor'" in note]
     assert len(unread) == 1 and isinstance(unread[0], Caution)
     assert not any("Height" in note and "not used" in note for note in reading.notes)

@@ -10,7 +10,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import load, split_for
 from gsparc.data.own import from_arrays
-from gsparc.data.spacing import path_order, visits
+from gsparc.data.spacing import group_visits, path_order
 from gsparc.data.split_files import read_split, write_split
 from gsparc.data.splits import SplitSettings, make_split
 
@@ -315,9 +315,9 @@ def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(ap
 
 def test_rows_a_tenth_of_a_step_apart_are_places_of_their_own():
     walk = np.cumsum(np.random.default_rng(0).uniform(0.1, 2, (500, 3)) * [1, 1, 0], axis=0)
-    assert visits(walk) is None
+    assert group_visits(walk) is None
     arrays = walk[::10, None] + np.linspace(0, 0.6, 6)[:, None] * [1, 0, 0]  # six antennas at every place
-    assert visits(arrays.reshape(-1, 3)) is None
+    assert group_visits(arrays.reshape(-1, 3)) is None
 
 
 @pytest.mark.parametrize("side_m", [None, 0.3, 0.5])

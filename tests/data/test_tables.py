@@ -9,7 +9,7 @@ import pytest
 
 from gsparc.data.own import interpret
 from gsparc.data.tables import heads
-from gsparc.data.tables.heads import understand
+from gsparc.data.tables.heads import understand_head
 from gsparc.data.tables.read import understand_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
@@ -32,7 +32,7 @@ STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
     ],
 )  # fmt: skip
 def test_usual_heads(head, role, unit):
-    found = understand(head)
+    found = understand_head(head)
     assert found.role == role and (unit is None or found.unit.name == unit)
 
 
@@ -98,6 +98,13 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     }
     arrays = understand_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).raw.arrays
     assert arrays["rssi_db"].tolist() == [4, 8]
+
+
+def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
+    """A map of the same levels said dB."""
+    table = understand_table(write("x,y,z,RSRP\n1,2,3,-80\n4,5,6,-81\n"))
+    assert "column 'RSRP' taken as rssi_db [dB]" in table.notes
+    assert interpret(table.raw, "table").data.site.level_unit == "dB"
 
 
 def test_many_transmitters_did_not_become_one_without_a_word(write):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.errors import DataError
-from gsparc.data.walls import SIMULATED, area, read_walls
+from gsparc.data.walls import SIMULATED, polygon_area, read_walls
 from gsparc.simulate.scenes.build import SceneSettings
 
 SCENES = Path(__file__).parents[2] / "conf" / "scene"
@@ -21,7 +21,7 @@ def written(path: Path, text: str) -> Path:
 def test_a_simulated_room_is_a_file_of_walls():
     found = read_walls(SCENES / "shoebox.yaml")
     assert len(found.faces) == 6 and found.boxes.shape == (1, 2, 3)
-    assert sum(map(area, found.faces)) == pytest.approx(2 * (6 * 5 + 6 * 3 + 5 * 3))
+    assert sum(map(polygon_area, found.faces)) == pytest.approx(2 * (6 * 5 + 6 * 3 + 5 * 3))
     assert {tuple(face.min(0)) for face in found.faces} >= {(0, 0, 0), (6, 0, 0), (0, 5, 0), (0, 0, 3)}
 
 
@@ -33,7 +33,7 @@ def test_walls_are_polygons(tmp_path):
     text = "walls:\n- {corners_m: [[0, 0, 0], [4, 0, 0], [4, 0, 3], [0, 0, 3]]}\n"
     text += "- [[0, 0, 0], [0, 2, 0], [0, 2, 2]]"
     found = read_walls(written(tmp_path / "a.yaml", text))
-    assert [area(face) for face in found.faces] == [12.0, 2.0] and len(found.boxes) == 0
+    assert [polygon_area(face) for face in found.faces] == [12.0, 2.0] and len(found.boxes) == 0
 
 
 MESH = """# a square as triangles, one as a polygon, texture and normals, numbers from the end
@@ -57,7 +57,7 @@ f -4 -3 -2 -1
 def test_a_mesh_has_faces_that_are_flat(tmp_path):
     found = read_walls(written(tmp_path / "a.obj", MESH))
     assert [len(face) for face in found.faces] == [3, 3, 3, 3]  # the last polygon is not flat
-    assert sum(area(face) for face in found.faces[:2]) == pytest.approx(4.0)
+    assert sum(polygon_area(face) for face in found.faces[:2]) == pytest.approx(4.0)
     assert np.array_equal(found.faces[2], [[0, 1, 0], [2, 1, 0], [2, 3, 0.5]])
 
 

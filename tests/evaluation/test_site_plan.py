@@ -7,7 +7,7 @@ from PIL import Image
 from releases import real
 
 from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.plausibility import link_levels, steps_of
+from gsparc.data.checks.plausibility import find_level_steps, link_levels
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan
@@ -39,7 +39,7 @@ def words(figure: Figure) -> str:
 
 def shown(data, figures):
     levels = link_levels(data)
-    draw_site(data, "unused.png", levels, [] if levels is None else steps_of(levels))
+    draw_site(data, "unused.png", levels, [] if levels is None else find_level_steps(levels))
     return figures[-1], words(figures[-1])
 
 

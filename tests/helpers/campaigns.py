@@ -9,7 +9,7 @@ import numpy as np
 from shoeboxes import scatter
 
 from gsparc.ops import SphereGrid
-from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox import Room, trace_room
 
 FREQUENCY_HZ = np.array([3.0e8, 3.1e8])  # a metre of wavelength: 100 places then tell something of the rest
 CONF = Path(__file__).parents[2] / "conf"
@@ -38,7 +38,7 @@ def channels(path: Path, rows: int = 80, moving: str = "rx", shape: str = "SAK")
     array = np.array([[0.0, 0, 0], [0.3, 0, 0]])
     where = scatter(room, rows, seed=0, margin=0.4)
     ends = (STILL, where) if moving == "rx" else (where, STILL)
-    traced = trace(room, *ends, FREQUENCY_HZ, max_order=1, array=array, snr_db=30)
+    traced = trace_room(room, *ends, FREQUENCY_HZ, max_order=1, array=array, snr_db=30)
     cut = {"S": traced.csi[:, 0, 0], "SK": traced.csi[:, 0], "SAK": traced.csi}[shape]
     frequency = FREQUENCY_HZ[0] if shape == "S" else FREQUENCY_HZ
     np.savez(path, tx_position=ends[0], rx_position=ends[1], csi=cut, frequency_hz=frequency)

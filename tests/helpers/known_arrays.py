@@ -8,7 +8,7 @@ import torch
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
-from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox import Room, trace_room
 
 WAVELENGTH = 0.3259
 RECEIVER = np.array([6.0, 2.0, 1.0])
@@ -60,5 +60,5 @@ def walk(rows: int, seed: int = 0, step: float = 0.012) -> np.ndarray:
 def room_vectors(tx: np.ndarray, order: int, array: np.ndarray):
     """Array vectors (S, M) of a traced room and the trace."""
     room = Room.uniform((7.0, 5.0, 3.0), -0.6)
-    traced = trace(room, tx, RECEIVER, LIGHT / WAVELENGTH, max_order=order, array=array @ TURN.T)
+    traced = trace_room(room, tx, RECEIVER, LIGHT / WAVELENGTH, max_order=order, array=array @ TURN.T)
     return traced.csi[:, :, 0], traced

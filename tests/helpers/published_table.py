@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.data.instantiate import node_of
+from gsparc.data.instantiate import config_node
 from gsparc.models.registry import method_class
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +44,7 @@ def settings(group: str, peer: str) -> dict[str, Any]:
     """Settings of a peer: ours (`model`), or those of conf/paper."""
     file = ROOT / "conf" / "paper" / f"{peer}.yaml"
     paper = yaml.safe_load(file.read_text(encoding="utf-8")).get("model", {}) if file.exists() else {}
-    chosen = node_of(method_class(peer)) if group == "model" else paper
+    chosen = config_node(method_class(peer)) if group == "model" else paper
     return {key: value for key, value in chosen.items() if key not in NO_SETTING}
 
 

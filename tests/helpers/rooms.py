@@ -8,7 +8,7 @@ from shoeboxes import as_arrays, scatter
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.simulate.shoebox import Room, Trace, trace
+from gsparc.simulate.shoebox import Room, Trace, trace_room
 
 WAVELENGTH = 299_792_458.0 / 2.4e9
 PILLAR = np.array([[[1.6, 1.2, 0.0], [2.0, 1.6, 2.5]]])
@@ -30,7 +30,7 @@ def shoebox(
     room = Room.uniform(size, reflection, occluders=PILLAR if pillar else np.zeros((0, 2, 3)))
     tx = np.array(size) * [0.15, 0.27, 0.75]
     rx = scatter(room, count, seed + 1, margin=0.1)
-    told = trace(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
+    told = trace_room(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
     data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
 
@@ -67,7 +67,7 @@ def furnished(count: int, *, snr_db: float = 30.0, seed: int = 0) -> tuple[Trace
     walls = np.array([-0.8, -0.6, -0.9, -0.7, -0.5, -0.75])
     room = Room(np.zeros(3), np.array([7.0, 5.0, 2.8]), walls, FURNITURE)
     rx = scatter(room, count, seed + 1, margin=0.1)
-    told = trace(room, np.array([0.4, 2.2, 2.0]), rx, 2.4e9, snr_db=snr_db, seed=seed)
+    told = trace_room(room, np.array([0.4, 2.2, 2.0]), rx, 2.4e9, snr_db=snr_db, seed=seed)
     data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
 

@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.ops import SphereGrid
-from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox import Room, trace_room
 
 
 def fold_of(data: Measurements, **split: Any) -> Fold:
@@ -43,7 +43,7 @@ def room(
 ) -> tuple[Measurements, Fold, np.ndarray]:
     """Channels in a 4 x 3 x 2.5 m box of mirrors, with its sources (I, 3); a wavelength of 1 m at 300 MHz."""
     box = Room.uniform((4.0, 3.0, 2.5), -0.6)
-    told = trace(
+    told = trace_room(
         box, np.array([0.7, 0.8, 1.9]), scatter(box, rows, seed=1, margin=0.3), frequency_hz,
         max_order=max_order, snr_db=40,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 import packets
 import pytest
 
-from gsparc.data.checks.coherence import allowed
+from gsparc.data.checks.coherence import set_freedom
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
 from gsparc.evaluation.open_runs import aligned
@@ -25,7 +25,7 @@ def logged():
     given, channel = packets.robot()
     del given["run"]
     tones = given["frequency_hz"] - given["frequency_hz"].mean()
-    return allowed(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
+    return set_freedom(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
 
 
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
@@ -43,7 +43,7 @@ def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(lo
 
 def test_rows_that_are_coherent_stay_as_they_are():
     data = packets.measurements(*packets.robot())
-    assert allowed(data, "auto") is data
+    assert set_freedom(data, "auto") is data
     assert with_common_phase(data, packets.shares(data, 0))[0] is data
 
 

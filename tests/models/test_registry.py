@@ -67,7 +67,7 @@ def test_entry_points_of_plugins_were_read_for_every_class_of_a_checkpoint(monke
     instantiate.refuse_foreign("gsparc.models.baselines.gp.GaussianProcess")
     monkeypatch.setattr(instantiate, "plugins", lambda group: {})
     for path in (
-        "gsparc.data.instantiate.find",
+        "gsparc.data.instantiate.import_target",
         "os.system",
         "gsparc.models.baselines.gp.torch.nn.Linear",
         None,

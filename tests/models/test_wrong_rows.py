@@ -18,7 +18,7 @@ from gsparc.data.schema import LIGHT
 from gsparc.models.registry import build, method_class, methods
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
-from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox import Room, trace_room
 from gsparc.training.context import FitContext
 
 ROOM = Room.uniform((4.0, 3.0, 2.5), -0.5)
@@ -95,7 +95,7 @@ def of_an_array(moving):
         grid, square = SphereGrid.hemisphere(9, 18), 0.25 * np.mgrid[:2, :2, :1].reshape(3, 4).T
         places = scatter(ROOM, 80, seed=0, margin=0.4)
         ends = (STILL, places) if moving == "rx" else (places, STILL)
-        heard = trace(ROOM, *ends, np.array([3e8]), max_order=1, array=square).csi[:, :, 0]
+        heard = trace_room(ROOM, *ends, np.array([3e8]), max_order=1, array=square).csi[:, :, 0]
         images = np.abs(heard @ steering(square, grid, LIGHT / 3e8).numpy().conj()).reshape(-1, 9, 18)
         facts = {"tx_position": ends[0], "rx_position": ends[1], "array_position": square, "carrier_hz": 3e8}
         np.savez(path, spectrum=images / images.max(), **facts)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, snapshots, world
-from gsparc.simulate.streets import Streets, trace
+from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, draw_snapshots, draw_world
+from gsparc.simulate.streets import Streets, trace_streets
 
 
 def _street(buildings: list, **more) -> Streets:
@@ -15,14 +15,14 @@ def _street(buildings: list, **more) -> Streets:
 
 def test_free_space_is_friis() -> None:
     users = np.array([[30.0, 40.0, 5.0]])
-    rays = trace(_street([], ground=0.0), users, 0.125)
+    rays = trace_streets(_street([], ground=0.0), users, 0.125)
     assert np.isclose(np.abs(rays.gain).max(), 0.125 / (4 * np.pi * 50))
     assert np.isclose(rays.delay[0, np.abs(rays.gain[0]).argmax()], 50 / LIGHT)
 
 
 def test_wall_makes_an_image() -> None:
     """A wall at y = 10 to 20: the user at (20, 0) hears the mirrored base at (0, 20) through it."""
-    rays = trace(_street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125)
+    rays = trace_streets(_street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125)
     strength = np.sort(np.abs(rays.gain[0]))[::-1]
     assert np.isclose(strength[0], 0.125 / (4 * np.pi * 20))
     assert np.isclose(strength[1], 0.7 * 0.125 / (4 * np.pi * np.hypot(20, 20)))
@@ -31,18 +31,18 @@ def test_wall_makes_an_image() -> None:
 
 def test_building_blocks_and_its_corner_diffracts() -> None:
     streets = _street([[[8, -10], [12, 2]]], ground=0.0)
-    behind = trace(streets, np.array([[20.0, 4.0, 5.0]]), 0.125)
+    behind = trace_streets(streets, np.array([[20.0, 4.0, 5.0]]), 0.125)
     assert streets.blocked(np.zeros((1, 2)), np.array([[20.0, 4.0]]))[0]
     assert 0 < np.abs(behind.gain).max() < 0.5 * 0.125 / (4 * np.pi * 20)
 
 
 def test_offsets_are_a_switch() -> None:
-    there = world(40, seed=0)
+    there = draw_world(40, seed=0)
     clean = there.response(CARRIER_HZ + TONES * SPACING_HZ)
-    still = snapshots(there, Offsets(0.0, 0.0, 0.0))
+    still = draw_snapshots(there, Offsets(0.0, 0.0, 0.0))
     noise = np.abs(still - clean) ** 2
     assert np.isclose(noise.mean(), there.noise_power, rtol=0.02)
-    turned = snapshots(there, Offsets(1.0, 0.0, 0.0))
+    turned = draw_snapshots(there, Offsets(1.0, 0.0, 0.0))
     angle = np.angle((turned * clean.conj()).sum((1, 2)))
     assert np.ptp(angle) > 3
     assert np.ptp(np.angle((still * clean.conj()).sum((1, 2)))) < 0.1

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, PropagationEffects, from_config
-from gsparc.simulate.paths import Paths, join
+from gsparc.simulate.paths import Paths, join_receivers
 
 EVERYTHING = PropagationEffects(depth=3)
 
@@ -50,7 +50,7 @@ def test_receivers_that_lose_everything_stay():
     found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
     less = found.under(PropagationEffects(depth=3).without("specular"))
     assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
-    both = join([found, less])
+    both = join_receivers([found, less])
     assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
 
 

@@ -14,14 +14,14 @@ needs_sionna = pytest.mark.skipif(
 
 @pytest.fixture(autouse=True)
 def forget():
-    llvm.fault.cache_clear()
+    llvm.library_fault.cache_clear()
 
 
 def test_named_library_is_the_only_candidate(monkeypatch):
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
-    assert llvm.candidates() == [Path("/nowhere/libLLVM.so")]
+    assert llvm.find_libraries() == [Path("/nowhere/libLLVM.so")]
     monkeypatch.delenv(llvm.VARIABLE)
-    assert Path("/nowhere/libLLVM.so") not in llvm.candidates()
+    assert Path("/nowhere/libLLVM.so") not in llvm.find_libraries()
 
 
 def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
@@ -31,7 +31,7 @@ def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(
         llvm, "TINY_SOLVE", "import os, sys; print('LLVM ERROR: fmaximum', file=sys.stderr); os.abort()"
     )
-    wrong = llvm.fault(library)
+    wrong = llvm.library_fault(library)
     assert wrong is not None and "signal 6" in wrong and "fmaximum" in wrong
 
 
@@ -39,7 +39,7 @@ def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
 def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
     with pytest.raises(llvm.SimulatorMissing) as raised:
-        llvm.prepare()
+        llvm.prepare_llvm()
     for words in ("/nowhere/libLLVM.so", "no such file", "python -m gsparc.simulate.llvm"):
         assert words in str(raised.value)
 
@@ -47,7 +47,7 @@ def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
 def test_missing_sionna_names_the_remedy(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
     with pytest.raises(llvm.SimulatorMissing, match="make sionna"):
-        llvm.prepare()
+        llvm.prepare_llvm()
 
 
 @pytest.mark.slow
@@ -66,5 +66,5 @@ def test_imports_leave_the_ray_tracer_alone():
 @pytest.mark.slow
 @needs_sionna
 def test_working_library_is_found():
-    library = llvm.prepare()
-    assert library.exists() and llvm.fault(library) is None
+    library = llvm.prepare_llvm()
+    assert library.exists() and llvm.library_fault(library) is None

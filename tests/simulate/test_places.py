@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from gsparc.data.links.georeference import Georeference
-from gsparc.data.walls import area, read_walls
+from gsparc.data.walls import polygon_area, read_walls
 from gsparc.simulate.raytracer import RayTracer
-from gsparc.simulate.scenes.receivers import Layout, neighbours, place, receivers, spread
+from gsparc.simulate.scenes.receivers import (
+    Layout,
+    draw_places,
+    farthest_points,
+    nearest_rows,
+    place_receivers,
+)
 from gsparc.simulate.scenes.solid import box, write_mesh
-from gsparc.simulate.scenes.transmitters import stations
+from gsparc.simulate.scenes.transmitters import place_transmitters
 
 AREA = np.array([[0.0, 0.0], [20.0, 10.0]])
 SOMEWHERE = Georeference(40.0, -30.0)
@@ -27,7 +33,7 @@ class Hut:
 
 
 def laid(georeference=None, streets=(), **settings):
-    return receivers(Layout(**settings), 30, AREA, (1.0, 2.0), 0, Hut(), streets, georeference)
+    return place_receivers(Layout(**settings), 30, AREA, (1.0, 2.0), 0, Hut(), streets, georeference)
 
 
 def test_sectors_are_stations_at_equal_angles():
@@ -36,7 +42,7 @@ def test_sectors_are_stations_at_equal_angles():
         {"position_m": [5, 5], "height_m": 2},
         {"name": "b", "position_deg": [40.001, -30.0], "height_m": 1.5, "pattern": "dipole"},
     ]
-    found = stations(entries, lambda across: np.full(len(across), 7.0), SOMEWHERE)
+    found = place_transmitters(entries, lambda across: np.full(len(across), 7.0), SOMEWHERE)
     assert [one.name for one in found] == ["mast-1", "mast-2", "mast-3", "tx1", "b"]
     assert [one.antenna.azimuth_deg for one in found[:3]] == [300, 60, 180]
     assert {one.antenna.pattern for one in found[:3]} == {"tr38901"} and found[3].antenna.pattern == "iso"
@@ -45,7 +51,7 @@ def test_sectors_are_stations_at_equal_angles():
 
 
 def test_a_third_coordinate_beside_degrees_was_ignored():
-    (found,) = stations([{"position_deg": [40.001, -30.0, 12.0], "height_m": 3}], None, SOMEWHERE)
+    (found,) = place_transmitters([{"position_deg": [40.001, -30.0, 12.0], "height_m": 3}], None, SOMEWHERE)
     np.testing.assert_allclose(found.position, [0, 111.03, 12.0], atol=0.02)
 
 
@@ -62,7 +68,7 @@ def test_a_third_coordinate_beside_degrees_was_ignored():
 ])  # fmt: skip
 def test_bad_transmitters_are_refused(entry, words):
     with pytest.raises(ValueError, match=words) as raised:
-        stations([entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE)
+        place_transmitters([entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE)
     assert "\n" not in str(raised.value)
 
 
@@ -134,10 +140,10 @@ def test_bad_receivers_are_refused(settings, words):
 
 def test_many_places_are_found_where_few_are_allowed():
     """Draws were 204,800 whatever was asked for: 100,000 did not fit where half is built on."""
-    found = place(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
+    found = draw_places(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
     assert len(found) == 2_500 and (found[:, 0] < 0.2).all()
     with pytest.raises(ValueError, match="0 of 20 receivers"):
-        place(20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)
+        draw_places(20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)
 
 
 def test_mesh_is_read_back_as_walls(tmp_path):
@@ -145,7 +151,7 @@ def test_mesh_is_read_back_as_walls(tmp_path):
     write_mesh(solid.vertices[solid.faces], tmp_path / "scene.obj")
     walls = read_walls(tmp_path / "scene.obj")
     assert len(walls) == 12
-    np.testing.assert_allclose(sum(map(area, walls.faces)), 2 * (6 + 9 + 6), atol=0.02)
+    np.testing.assert_allclose(sum(map(polygon_area, walls.faces)), 2 * (6 + 9 + 6), atol=0.02)
     corners = np.unique(np.concatenate(walls.faces), axis=0)
     assert len(corners) == 8
     np.testing.assert_allclose(np.sort(corners, 0), np.sort(solid.vertices, 0), atol=6e-4)
@@ -154,9 +160,9 @@ def test_mesh_is_read_back_as_walls(tmp_path):
 def test_places_that_repeat_were_drawn_again_and_neighbours_of_themselves():
     """Probes of a receiver that stands still were also those that their effects were verified on."""
     places = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [5, 0, 0]])
-    assert sorted(spread(places, 4, seed=0)) == [0, 1, 2, 3]
+    assert sorted(farthest_points(places, 4, seed=0)) == [0, 1, 2, 3]
     rows = np.arange(3)
-    assert (neighbours(places, rows) != rows).all()
+    assert (nearest_rows(places, rows) != rows).all()
 
 
 def test_the_sky_over_an_area_beside_the_scene_was_the_mean_of_nothing():

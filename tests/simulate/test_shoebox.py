@@ -3,7 +3,7 @@ import pytest
 from shoeboxes import scatter
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.shoebox import Room, images, trace, visible
+from gsparc.simulate.shoebox import Room, mirror_images, trace_room, visible_images
 
 ROOM = Room(
     lower=np.array([-1.0, 0.5, 0.0]),
@@ -19,12 +19,12 @@ def mirror(point, axis, wall):
 
 
 def test_counts_and_orders_of_images():
-    assert [len(images(ROOM, n).cell) for n in range(4)] == [1, 7, 25, 63]
-    assert images(ROOM, 2).order.tolist() == [0] + [1] * 6 + [2] * 18
+    assert [len(mirror_images(ROOM, n).cell) for n in range(4)] == [1, 7, 25, 63]
+    assert mirror_images(ROOM, 2).order.tolist() == [0] + [1] * 6 + [2] * 18
 
 
 def test_images_are_mirrors_in_the_walls():
-    mirrored, point = images(ROOM, 2), np.array([0.2, 1.1, 0.9])
+    mirrored, point = mirror_images(ROOM, 2), np.array([0.2, 1.1, 0.9])
     walls = [(0, -1.0), (0, 4.0), (1, 0.5), (1, 3.5), (2, 0.0), (2, 2.5)]
     wanted = [(mirror(point, *wall), gain) for wall, gain in zip(walls, ROOM.reflection, strict=True)]
     wanted += [(mirror(mirror(point, 0, 4.0), 0, -1.0), 0.9 * 0.8)]  # in the high wall, then in the low one
@@ -38,13 +38,13 @@ def test_images_are_mirrors_in_the_walls():
 def test_reciprocity(occluders):
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, occluders)
     tx, rx = scatter(room, 40, seed=0), scatter(room, 40, seed=1)
-    there = trace(room, tx, rx, 2.4e9, max_order=3).csi
-    np.testing.assert_allclose(trace(room, rx, tx, 2.4e9, max_order=3).csi, there, rtol=1e-9, atol=1e-15)
+    there = trace_room(room, tx, rx, 2.4e9, max_order=3).csi
+    np.testing.assert_allclose(trace_room(room, rx, tx, 2.4e9, max_order=3).csi, there, rtol=1e-9, atol=1e-15)
 
 
 def _bounce_by_bounce(room, tx, rx, cell):
     """The folded path walked wall by wall: is any of its legs inside an occluder? Dense sampling."""
-    mirrored = images(room, int(np.abs(cell).sum()))
+    mirrored = mirror_images(room, int(np.abs(cell).sum()))
     i = int(np.flatnonzero((mirrored.cell == cell).all(axis=1))[0])
     signs, offsets = mirrored.signs[i], mirrored.offsets[i]
     unfolded = rx + np.linspace(0, 1, 20001)[:, None] * (signs * tx + offsets - rx)
@@ -57,9 +57,9 @@ def _bounce_by_bounce(room, tx, rx, cell):
 
 def test_visibility_equals_walking_the_folded_path():
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
-    mirrored = images(room, 3)
+    mirrored = mirror_images(room, 3)
     tx, rx = scatter(room, 4, seed=2), scatter(room, 4, seed=3)
-    seen = visible(room, mirrored, tx, rx)
+    seen = visible_images(room, mirrored, tx, rx)
     walked = np.array([[_bounce_by_bounce(room, t, r, c) for c in mirrored.cell]
                        for t, r in zip(tx, rx, strict=True)])  # fmt: skip
     # Dense sampling may miss a grazing path by a fraction of a millimetre, never the other way round.
@@ -68,7 +68,9 @@ def test_visibility_equals_walking_the_folded_path():
 
 def test_line_of_sight_amplitude_phase_and_delay():
     frequency = np.array([2.40e9, 2.41e9])
-    csi = trace(ROOM, np.array([0.0, 1, 1]), np.array([[3.0, 1, 1], [2.0, 1, 1]]), frequency, max_order=0).csi
+    csi = trace_room(
+        ROOM, np.array([0.0, 1, 1]), np.array([[3.0, 1, 1], [2.0, 1, 1]]), frequency, max_order=0
+    ).csi
     distance = np.array([3.0, 2.0])[:, None]
     expected = LIGHT / frequency / (4 * np.pi * distance) * np.exp(-2j * np.pi * frequency * distance / LIGHT)
     np.testing.assert_allclose(csi[:, 0], expected, rtol=1e-9)
@@ -77,7 +79,7 @@ def test_line_of_sight_amplitude_phase_and_delay():
 def test_moving_transmitter_sees_a_mirrored_array():
     array = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
     tx, rx = scatter(ROOM, 10, seed=4), np.array([3.0, 2.0, 1.2])
-    traced = trace(ROOM, tx, rx, 2.4e9, max_order=2, array=array)
+    traced = trace_room(ROOM, tx, rx, 2.4e9, max_order=2, array=array)
     mirrored = traced.images.of(rx + array)  # (A, I, 3): images of the elements, not of the transmitter
     distance = np.linalg.norm(tx[:, None, None] - mirrored, axis=-1)
     k = 2 * np.pi * 2.4e9 / LIGHT
@@ -89,18 +91,18 @@ def test_moving_transmitter_sees_a_mirrored_array():
 
 def test_noise_level_and_seed():
     tx, rx = np.array([0.0, 1, 1]), scatter(ROOM, 400, seed=5)
-    clean = trace(ROOM, tx, rx, 2.4e9)
-    noisy = trace(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1)
+    clean = trace_room(ROOM, tx, rx, 2.4e9)
+    noisy = trace_room(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1)
     ratio = np.mean(np.abs(clean.csi) ** 2) / np.mean(np.abs(noisy.csi - clean.csi) ** 2)
     assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.7)
-    np.testing.assert_array_equal(noisy.csi, trace(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1).csi)
+    np.testing.assert_array_equal(noisy.csi, trace_room(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1).csi)
 
 
 def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="rx, row 1"):
-        trace(ROOM, np.array([0.0, 1, 1]), np.array([[0.0, 1, 1.5], [9.0, 1, 1]]), 2.4e9)
+        trace_room(ROOM, np.array([0.0, 1, 1]), np.array([[0.0, 1, 1.5], [9.0, 1, 1]]), 2.4e9)
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
     with pytest.raises(ValueError, match="inside an occluder"):
-        trace(room, np.array([1.2, 1.8, 1]), np.array([0.0, 1, 1.5]), 2.4e9)
+        trace_room(room, np.array([1.2, 1.8, 1]), np.array([0.0, 1, 1.5]), 2.4e9)
     with pytest.raises(ValueError, match="upper"):
         Room(ROOM.upper, ROOM.lower, ROOM.reflection)

@@ -15,10 +15,10 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, PropagationEffects
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import SceneSettings, build, from_config
+from gsparc.simulate.scenes.build import SceneSettings, build_survey, from_config
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.receivers import clear_of, place
-from gsparc.simulate.scenes.shipped import settings
+from gsparc.simulate.scenes.receivers import draw_places, stands_clear_of
+from gsparc.simulate.scenes.shipped import shipped_scene_settings
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import SpectrumSettings
 
@@ -40,7 +40,7 @@ CONFERENCE = SceneSettings(
 @pytest.fixture(scope="module", autouse=True)
 def sionna():
     try:
-        llvm.prepare()
+        llvm.prepare_llvm()
     except llvm.SimulatorMissing as missing:
         pytest.skip(str(missing))
 
@@ -52,12 +52,16 @@ def room():
 
 @pytest.fixture(scope="module")
 def places():
-    return place(60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
+    return draw_places(
+        60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, stands_clear_of(conference_room()), seed=0
+    )
 
 
 def test_one_thread_is_deterministic():
     """Of several threads the faster one's candidate stays: a hundredth of receivers differed by rounding."""
-    where = place(800, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
+    where = draw_places(
+        800, np.array(CONFERENCE.area_m), CONFERENCE.height_m, stands_clear_of(conference_room()), seed=0
+    )
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -153,12 +157,17 @@ def test_chains_share_no_hash(places):
 
 
 def test_calls_have_one_of_few_sizes():
-    assert raytracer.calls(464, 200) == [(200, 200), (200, 200), (64, 67)]
-    assert raytracer.calls(200, 200) == [(67, 67), (67, 67), (66, 67)] and len(raytracer.calls(150, 200)) == 3
-    assert raytracer.calls(208, 200) == [(200, 200), (8, 67)] and raytracer.calls(350, 200)[1] == (150, 200)
-    assert raytracer.calls(1, 200) == [(1, 1)] and raytracer.calls(5, 200) == [(5, 8)]
+    assert raytracer.divide_into_calls(464, 200) == [(200, 200), (200, 200), (64, 67)]
+    assert (
+        raytracer.divide_into_calls(200, 200) == [(67, 67), (67, 67), (66, 67)]
+        and len(raytracer.divide_into_calls(150, 200)) == 3
+    )
+    assert raytracer.divide_into_calls(208, 200) == [(200, 200), (8, 67)] and raytracer.divide_into_calls(
+        350, 200
+    )[1] == (150, 200)
+    assert raytracer.divide_into_calls(1, 200) == [(1, 1)] and raytracer.divide_into_calls(5, 200) == [(5, 8)]
     for receivers in range(1, 402):
-        parts = raytracer.calls(receivers, 200)
+        parts = raytracer.divide_into_calls(receivers, 200)
         assert sum(count for count, _ in parts) == receivers
         assert all(count <= size and size in (1, 3, 8, 23, 67, 200) for count, size in parts)
 
@@ -190,18 +199,18 @@ def test_polarisation_edges_and_scattering_are_recorded(room, places):
 
 def test_shipped_scene_needs_only_its_name():
     """Area, transmitter and sky are found; materials scatter; nobody stands on roofs."""
-    city = from_config({**settings("etoile"), "num_receivers": 30})
-    survey = build(city, QUICK)
+    city = from_config({**shipped_scene_settings("etoile"), "num_receivers": 30})
+    survey = build_survey(city, QUICK)
     engine, places = survey.engine, survey.places
     assert all(m["scattering"] > 0 for m in engine.materials().values())
     height, ground = engine.surface(places[:, :2])
     assert ground.all() and (places[:, 2] - height < 1.81).all() and (places[:, 2] - height > 1.19).all()
     assert np.ptp(places[:, :2], axis=0).max() <= 400 and survey.transmitters[0, 2] >= 10
-    above = build(replace(city, over="roofs"), QUICK)
+    above = build_survey(replace(city, over="roofs"), QUICK)
     assert not above.engine.surface(above.places[:, :2])[1].all()
-    assert not build(from_config({**settings("box"), "num_receivers": 20}), QUICK).engine.has_open_sky(
-        np.array([[-4.0, -4], [4, 4]])
-    )
+    assert not build_survey(
+        from_config({**shipped_scene_settings("box"), "num_receivers": 20}), QUICK
+    ).engine.has_open_sky(np.array([[-4.0, -4], [4, 4]]))
 
 
 def test_town_with_sectors_in_degrees(tmp_path):
@@ -229,14 +238,14 @@ def test_scene_file_of_the_user(tmp_path):
 
     own = replace(CONFERENCE, builder=None, xml=str(rt.scene.floor_wall), area_m=((-3, -3), (3, 3)),
                   transmitter_m=(-2.0, 0.0, 3.0), num_receivers=20)  # fmt: skip
-    survey = build(own, QUICK)
+    survey = build_survey(own, QUICK)
     engine, receivers = survey.engine, survey.places
     assert engine.trace(receivers, PLAIN).received_power().min() > 0
     with pytest.raises(ValueError, match="no such file"):
-        build(replace(own, xml=str(tmp_path / "none.xml")), QUICK)
+        build_survey(replace(own, xml=str(tmp_path / "none.xml")), QUICK)
     (tmp_path / "bad.xml").write_text("<scene version='2.1.0'><oops/></scene>")
     with pytest.raises(ValueError, match="cannot read it"):
-        build(replace(own, xml=str(tmp_path / "bad.xml")), QUICK)
+        build_survey(replace(own, xml=str(tmp_path / "bad.xml")), QUICK)
 
 
 def test_auto_in_the_conference_room(tmp_path):

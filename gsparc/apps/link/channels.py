@@ -104,9 +104,9 @@ def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarr
 
 @lru_cache(maxsize=1)
 def _streets(*facts: int) -> World:
-    from gsparc.simulate.argos_sim import world
+    from gsparc.simulate.argos_sim import draw_world
 
-    return world(*facts)
+    return draw_world(*facts)
 
 
 def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:

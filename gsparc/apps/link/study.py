@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.prediction.risk import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
@@ -102,7 +102,9 @@ def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Ra
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
     delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in settings["care"]}
     care = max(delivered, key=lambda c: delivered[c])
-    return [rates for _, rates in each(lambda noise: loop.rates(band, noise, care), noises, "noise levels")]
+    return [
+        rates for _, rates in run_each(lambda noise: loop.rates(band, noise, care), noises, "noise levels")
+    ]
 
 
 def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
@@ -176,7 +178,7 @@ def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int,
         steep = fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]
         return [few, pusch.run(band, level, order[coarse:fine], batch)] if steep else [few]
 
-    return pd.concat(chain(*(blocks for _, blocks in each(at, levels, "Eb/N0"))), ignore_index=True)
+    return pd.concat(chain(*(blocks for _, blocks in run_each(at, levels, "Eb/N0"))), ignore_index=True)
 
 
 def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:

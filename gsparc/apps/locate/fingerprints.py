@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.apps.locate.judging import Localisation, sample_rows
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
-from gsparc.data.datasets.fingerprints import Fingerprints, parted, read_fingerprints
+from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
 from gsparc.data.limits import POSITIVE, SHARE
 
 METHOD = "weighted_knn"
@@ -41,7 +41,7 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
     if config.data:
         known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
     else:
-        known, heard = map(rows.at, parted(rows, how, *cut, int(config.seed)))
+        known, heard = map(rows.at, split_fingerprints(rows, how, *cut, int(config.seed)))
     heard = heard.at(sample_rows(config, len(heard.level)))
     both = fingerprint_snapshots(heard), fingerprint_snapshots(known)
     place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])

@@ -24,7 +24,7 @@ from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
-from gsparc.data.own import interpreted
+from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.drawing import panels, save
@@ -193,7 +193,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
-        other = aligned(interpreted(raw, config.data), site)
+        other = aligned(interpret_and_log(raw, config.data), site)
         heard = group_snapshots(other, np.arange(len(other)))
     return heard.at(sample_rows(config, len(heard))), placed
 

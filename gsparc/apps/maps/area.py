@@ -12,9 +12,9 @@ from matplotlib.path import Path as Outline
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.blocks import memory
+from gsparc.data.blocks import machine_memory
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null
+from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null
 from gsparc.data.schema import Site
 from gsparc.prediction.query import usual_heights
 
@@ -87,7 +87,7 @@ def lay_grid(
     step = step_m or float(np.sqrt(max(float(width.prod()), 1e-12) / CELLS))
     count = np.ceil(width / step - 1e-9)
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
-    if needed > SHARE_OF_MEMORY * memory():
+    if needed > SHARE_OF_MEMORY * machine_memory():
         raise DataError(
             f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} "
             f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
@@ -133,7 +133,7 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
 
 
 def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:
-    corners = finite(area)
+    corners = finite_array(area)
     if corners.shape != (4,):
         raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
     if np.abs(corners).max() > FARTHEST:

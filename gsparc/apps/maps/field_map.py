@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 from gsparc.apps.maps.area import Grid
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.links.georeference import Georeference
 
 REFUSED = -1  # of `best_server`
@@ -237,7 +237,7 @@ def read_loads(load: float | Sequence[float] | Mapping[str, float], stations: Se
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
         load = [load.get(name, 1.0) for name in stations]
-    values = finite(load)
+    values = finite_array(load)
     if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
         fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"
         raise DataError(f"load={load}: {fault}")

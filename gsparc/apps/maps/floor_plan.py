@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError, reason
-from gsparc.data.limits import finite
+from gsparc.data.errors import DataError, explain_error
+from gsparc.data.limits import finite_array
 
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
 DARK = 128  # of 255: walls are darker
@@ -76,7 +76,7 @@ def read_floor_plan(path: str | Path, points: Sequence[Sequence[float]] | None) 
     except Image.DecompressionBombError as error:
         most = f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels are read, {LARGEST} a side are kept"
         raise DataError(
-            f"plan={path}: too large an image ({reason(error).partition(' exceeds')[0]}); {most}"
+            f"plan={path}: too large an image ({explain_error(error).partition(' exceeds')[0]}); {most}"
         ) from None
     except (UnidentifiedImageError, OSError, ValueError):
         raise DataError(f"plan={path}: not an image that can be read; expected PNG or JPEG") from None
@@ -90,7 +90,7 @@ def read_floor_plan(path: str | Path, points: Sequence[Sequence[float]] | None) 
 
 
 def _checked(points: Any, path: str | Path) -> np.ndarray:
-    pairs = finite(points)
+    pairs = finite_array(points)
     if pairs.shape != (2, 4):
         raise DataError(f"plan_points={points}: two points of four numbers are needed; {SHOW}")
     if np.hypot(*(pairs[1, :2] - pairs[0, :2])) < LEAST_PIXELS:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 from gsparc.data.files import whole_file
 from gsparc.data.links.georeference import Georeference
 
@@ -54,7 +54,7 @@ def read_shapes(
     except FileNotFoundError:
         raise DataError(f"{where}: no such file") from None
     except (*UNREADABLE, shapely.errors.ShapelyError) as error:
-        raise DataError(f"{where}: not readable as GeoJSON ({reason(error)})") from None
+        raise DataError(f"{where}: not readable as GeoJSON ({explain_error(error)})") from None
     while (shapely.get_type_id(parts) > POLYGON).any():
         parts = shapely.get_parts(parts)
     kind = shapely.get_type_id(parts)

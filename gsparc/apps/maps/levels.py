@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data.schema import Kind, Measurements
-from gsparc.data.units import in_decibels
+from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Prediction
 from gsparc.prediction.predictor import Predictor
 
@@ -38,7 +38,7 @@ def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> 
         power, error = own + error, 2 * own * error + error**2
     level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
     good = np.isfinite(power) & (power > 0)
-    level[good], spread[good] = in_decibels(power[good], error[good])
+    level[good], spread[good] = power_in_decibels(power[good], error[good])
     if variance is None:
         spread[good] = 1.0
     return level, np.where(spread > 0, spread, np.nan)

@@ -20,10 +20,10 @@ from gsparc.apps.maps.levels import MAPPED, joint_levels, predicted_levels
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data.errors import DataError
-from gsparc.data.executor import each
-from gsparc.data.instantiate import suggest
-from gsparc.data.limits import finite
-from gsparc.data.links.stations import station_number
+from gsparc.data.executor import run_each
+from gsparc.data.instantiate import suggest_or_list
+from gsparc.data.limits import finite_array
+from gsparc.data.links.stations import find_station
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import sites_of
@@ -172,9 +172,9 @@ def choose_stations(
     names: list[str] = []
     called = [*stations.name, *(getattr(stations, "label", None) or ())]
     for one in wanted if wanted is not None else stations.name:
-        number = station_number(one, called, len(stations))
+        number = find_station(one, called, len(stations))
         if number is None:
-            raise DataError(f"{key}: no station {one!r}{suggest(str(one), called)}")
+            raise DataError(f"{key}: no station {one!r}{suggest_or_list(str(one), called)}")
         names.append(stations.name[number % len(stations)])
     if not names:
         raise DataError("stations=[]: name one at least, or all")
@@ -230,7 +230,7 @@ def _asker(
 
     def ask(cells: np.ndarray) -> np.ndarray:
         levels, parts = np.zeros((len(cells), 3 * len(numbers) if joint else 2)), _chunks(cells, CHUNK)
-        for number, values in each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
+        for number, values in run_each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
             levels[number * CHUNK : number * CHUNK + len(values)] = values
         return levels
 
@@ -273,7 +273,7 @@ def query_ends(
 
 def read_place(name: str, value: Any) -> np.ndarray:
     """(3,) [m] of the setting `name`; `DataError` where it is no place."""
-    place = finite(value)
+    place = finite_array(value)
     if place.shape != (3,):
         raise DataError(f"{name}={value}: three finite numbers [m] are needed")
     return place

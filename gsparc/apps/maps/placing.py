@@ -14,10 +14,10 @@ from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
-from gsparc.data.blocks import evenly
+from gsparc.data.blocks import evenly_spaced
 from gsparc.data.errors import DataError
-from gsparc.data.executor import each
-from gsparc.data.limits import Checked, check_arguments, finite, number, setting, whole
+from gsparc.data.executor import run_each
+from gsparc.data.limits import Checked, check_arguments, finite_array, number, setting, whole
 from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
@@ -56,7 +56,7 @@ class Antenna(Checked):
         Raises:
             DataError: azimuths that are no numbers.
         """
-        azimuth = np.atleast_1d(finite(NO_PATTERN if self.azimuth is None else self.azimuth))
+        azimuth = np.atleast_1d(finite_array(NO_PATTERN if self.azimuth is None else self.azimuth))
         if azimuth.ndim > 1 or not len(azimuth):
             raise DataError(f"antenna.azimuth={self.azimuth}: degrees from north, like [0,120,240]")
         azimuth = azimuth if self.azimuth is None else azimuth % 360
@@ -168,7 +168,7 @@ def place_station(
         return goals
 
     scores = np.empty((len(candidates), 3))
-    for row, goals in each(tried, list(candidates), "candidates"):
+    for row, goals in run_each(tried, list(candidates), "candidates"):
         scores[row] = goals
     before = float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
@@ -213,7 +213,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
-    few = every[evenly(len(every), count)]
+    few = every[evenly_spaced(len(every), count)]
     return np.column_stack([few[:, :2], np.full(len(few), height)])
 
 

@@ -21,7 +21,7 @@ from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, finite, number, or_null, whole
+from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
@@ -243,7 +243,7 @@ def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
 
 
 def _start(value: Sequence[float]) -> np.ndarray:
-    place = finite(value)
+    place = finite_array(value)
     if place.shape not in ((2,), (3,)):
         raise DataError(f"start={value}: [x,y] in metres is needed")
     return place[None, :2]

@@ -15,7 +15,7 @@ from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
-from gsparc.data.blocks import evenly
+from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
@@ -86,7 +86,7 @@ def build_scene(
 
 
 def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
-    chosen = evenly(len(measured.places), MOST_POINTS)
+    chosen = evenly_spaced(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
     legends[VALUES] = Legend.over(measured.label, values)
     return Points(VALUES, places, legends[VALUES].of(values), DOT * extent)

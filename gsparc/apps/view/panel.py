@@ -8,7 +8,7 @@ import numpy as np
 
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer
-from gsparc.data.blocks import evenly
+from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import panels
 
@@ -20,7 +20,7 @@ FLOOR_DB = -60.0  # below the largest entry of a channel, where its response end
 def response_db(response: np.ndarray) -> np.ndarray:
     """Lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K); the mean (A,) of one tone."""
     power = np.abs(response).astype(np.float64) ** 2
-    power = power[:, 0] if power.shape[1] == 1 else power[evenly(len(power), MOST_LINES)]
+    power = power[:, 0] if power.shape[1] == 1 else power[evenly_spaced(len(power), MOST_LINES)]
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 

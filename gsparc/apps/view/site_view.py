@@ -18,7 +18,7 @@ from gsparc.apps.view.building import VALUES, Sphere, build_scene, start_place
 from gsparc.apps.view.plane import Plane, refine_plane
 from gsparc.apps.view.scene import EXTENT, Points, Scene
 from gsparc.apps.view.viewed import Measured, Viewed
-from gsparc.data.blocks import evenly
+from gsparc.data.blocks import evenly_spaced
 
 
 @dataclass(frozen=True)
@@ -135,4 +135,4 @@ def walk_places(view: SiteView, name: str | None, count: int) -> Sequence[np.nda
         low, high = view.viewed.box()
         return [low + (high - low) * share for share in np.linspace(0.1, 0.9, count)]
     places = measured.places
-    return list(places[evenly(len(places), count)])
+    return list(places[evenly_spaced(len(places), count)])

@@ -9,8 +9,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 
-from gsparc.data.instantiate import GROUPS, node_of, plugins
-from gsparc.simulate.scenes.shipped import settings, shipped
+from gsparc.data.instantiate import GROUPS, config_node, plugins
+from gsparc.simulate.scenes.shipped import list_shipped_scenes, shipped_scene_settings
 
 
 def offer() -> None:
@@ -21,7 +21,7 @@ def offer() -> None:
     for group in GROUPS:
         for name, path in plugins(group).items():
             try:
-                own = node_of(get_class(path))
+                own = config_node(get_class(path))
             except Exception as error:  # whatever another package does when it is imported
                 warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
                 continue
@@ -37,6 +37,10 @@ def offer_scenes() -> None:
     """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`, which lists them."""
     written = resources.files("gsparc.conf") / "scene"
     # Scenes that have a file of ours keep its settings.
-    nodes = {name: settings(name) for name in shipped() if not (written / f"{name}.yaml").is_file()}
+    nodes = {
+        name: shipped_scene_settings(name)
+        for name in list_shipped_scenes()
+        if not (written / f"{name}.yaml").is_file()
+    }
     for name, node in {**nodes, "help": {"name": "help"}}.items():
         ConfigStore.instance().store(name=name, group="scene", node=node, provider="sionna")

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.files import SUMMARY, set_aside, sweep
+from gsparc.data.files import SUMMARY, delete_partial_files, set_aside
 
 LOCK, HOLDER = ".lock", ".held-by"
 _locks: list[FileLock] = []  # by the command that is running
@@ -66,7 +66,7 @@ def hold(folder: Path, jobs: bool = False) -> None:
     for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
         if other.exists() and other.parent != folder:
             _lock(other.parent).release()
-    sweep(folder)
+    delete_partial_files(folder)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from gsparc.data import executor
 from gsparc.data.executor import Engine
-from gsparc.data.instantiate import suggest
+from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
 from gsparc.models.registry import known
@@ -75,7 +75,7 @@ class RunSettings(Checked):
         if settings.threads is not None:
             torch.set_num_threads(settings.threads)
         address = (values.get("ray") or {}).get("address")
-        executor.use(Engine(values.get("engine", "process"), values.get("workers"), address))
+        executor.use_engine(Engine(values.get("engine", "process"), values.get("workers"), address))
         threadpool_limits(
             1, "blas"
         )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
@@ -95,7 +95,7 @@ def _methods(names: Any) -> tuple[str, ...] | None:
     if isinstance(names, list) and all(name in methods for name in names):
         return tuple(names)
     wrong = next((b for b in names if b not in methods), names) if isinstance(names, list) else names
-    hint = suggest(str(wrong), methods)
+    hint = suggest_or_list(str(wrong), methods)
     raise SettingError(f"baselines={names}: a list of methods is needed, {wrong!r} is none{hint}")
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
-from gsparc.data.spacing import between
+from gsparc.data.spacing import nearest_neighbour_distance
 from gsparc.physics.row_factors import FREEDOMS, Freedom, alignment_factors, freedom_words, resolvable_delays
 
 log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class Coherence:
         )
 
 
-def coherence(data: Measurements) -> Coherence | None:
+def estimate_coherence(data: Measurements) -> Coherence | None:
     """Judge the phases of channels; None where no rows are near enough, or there is one entry a row.
 
     Rows are compared within a run, and all antennas or stations of a moment as one. Nothing is drawn.
@@ -100,8 +100,8 @@ def coherence(data: Measurements) -> Coherence | None:
     return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
 
 
-def allowed(data: Measurements, align: str) -> Measurements:
-    """Return measurements with what is free of each row: as `align` says, `auto` by `coherence`.
+def set_freedom(data: Measurements, align: str) -> Measurements:
+    """Return measurements with what is free of each row: as `align` says, `auto` by `estimate_coherence`.
 
     Raises:
         SettingError: no such freedom, or one of what are no channels.
@@ -114,12 +114,12 @@ def allowed(data: Measurements, align: str) -> Measurements:
         return data
     freedom: Freedom = align  # type: ignore[assignment]
     if align == "auto":
-        found = coherence(data)
+        found = estimate_coherence(data)
         if found is None or found.freedom == "none":
             return data
         freedom = found.freedom
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
-        if (apart := between(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
+        if (apart := nearest_neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
             what = "neighbours tell levels, not the shape over subcarriers"
             log.warning("places are %.3g wavelengths apart: %s", apart, what)
     return replace(data, site=replace(data.site, freedom=freedom))

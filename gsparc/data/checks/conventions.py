@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.conventions import CONVENTIONS, array_of, mended, traits, without_zeros
-from gsparc.data.errors import some
+from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_array, mask_zero_tones, traits
+from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
 
@@ -67,11 +67,11 @@ def convention_warnings(data: Measurements) -> list[str]:
     rows = _drawn(whole)
     few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]
     zeros = _zeros(drawn) if kind == "csi" and len(rows) else []  # none where an end is at an unknown place
-    entries = drawn.target.shape[2] * (1 if array_of(drawn) is None else drawn.target.shape[1])
+    entries = drawn.target.shape[2] * (1 if known_array(drawn) is None else drawn.target.shape[1])
     if len(rows) < FEWEST[kind]:
         return zeros
     if kind == "csi":
-        return [*zeros, *_rivals(without_zeros(drawn), few, labels)] if entries >= COHERENT else zeros
+        return [*zeros, *_rivals(mask_zero_tones(drawn), few, labels)] if entries >= COHERENT else zeros
     return _rivals(drawn, few, labels) + _decibels(drawn)
 
 
@@ -110,7 +110,7 @@ def _zeros(data: Measurements) -> list[str]:
     zero = np.flatnonzero(~measured.any(axis=(0, 1)))
     if not len(zero):
         return []
-    which = f"tones {some(zero.tolist())} (of {measured.shape[2]}, from 0) are 0 in all rows"
+    which = f"tones {list_first(zero.tolist())} (of {measured.shape[2]}, from 0) are 0 in all rows"
     return [f"{which}: guards, or the direct current? dataset.zeros_unmeasured=true: they were not measured"]
 
 
@@ -122,7 +122,7 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
     rivals = {}
     for name in names:
         with suppress(ValueError):  # a grid turned beyond a pole
-            rivals[name] = _score(mended(data, [name]), labels)
+            rivals[name] = _score(convert_conventions(data, [name]), labels)
 
     def may_be(name: str, rival: Score) -> bool:
         gain = float((rival.rows - declared.rows).mean())
@@ -161,7 +161,7 @@ def _channels(data: Measurements, tones: np.ndarray, labels: np.ndarray) -> Scor
     """By the share of power along the direct path, with factors of rows and antennas and a common delay."""
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     values = np.where(measured, data.target, 0).astype(np.complex128)
-    away, array = (data.tx - data.rx_position)[:, None], array_of(data)
+    away, array = (data.tx - data.rx_position)[:, None], known_array(data)
     if array is not None:
         away = away - np.einsum("sij,aj->sai", data.rx_rotation, array)
     distance = np.linalg.norm(away, axis=2)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data.checks import outliers
-from gsparc.data.checks.coherence import coherence
-from gsparc.data.errors import some
+from gsparc.data.checks.coherence import estimate_coherence
+from gsparc.data.errors import list_first
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.spacing import between
+from gsparc.data.spacing import nearest_neighbour_distance
 from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
@@ -19,7 +19,12 @@ LONG_ARRAY = 100  # wavelengths: no array of one receiver
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """Return (topic, sentence) pairs about a dataset; topics of what it has none of are left out."""
-    site, phases, own, error = data.site, coherence(data), data.release_split, data.site.convergence_error
+    site, phases, own, error = (
+        data.site,
+        estimate_coherence(data),
+        data.release_split,
+        data.site.convergence_error,
+    )
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.side(np.arange(len(data))) == side).sum()) for side in (1, -1))
     paths, scale = data.directions, site.target_scale
@@ -28,9 +33,9 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", neighbours(places_of(data), site.wavelength)),
+        ("neighbours", describe_spacing(distinct_places(data), site.wavelength)),
         *(("units?", hint) for hint in suspicious_values(data)),
-        *(("outliers?", warning) for warning in outliers.warnings(data)),
+        *(("outliers?", warning) for warning in outliers.outlier_warnings(data)),
         ("carrier", _carrier(site)),
         ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
         ("grid", "" if site.grid is None else _grid(site.grid)),
@@ -44,14 +49,14 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
          if data.mask is not None and data.censored is None else ""),
         ("directions", "" if paths is None else f"{sum(map(len, paths))} directions of arrival"),
         ("split", "" if own is None else f"its own: {len(own[0])} rows to train, {len(own[1])} to test"),
-        ("split?", proposal(data)),
+        ("split?", propose_split(data)),
         ("convergence", "" if error is None else f"solver error (NMSE between two seeds) {error:.3g}"),
         ("sha256", site.sha256),
     ]  # fmt: skip
     return [(topic, sentence) for topic, sentence in lines if sentence]
 
 
-def in_short(data: Measurements, split: Split) -> list[tuple[str, str]]:
+def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
     train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
     folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
@@ -71,7 +76,7 @@ def _carrier(site: Site) -> str:
     return f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
 
 
-def places_of(data: Measurements) -> np.ndarray:
+def distinct_places(data: Measurements) -> np.ndarray:
     """Return places (n, 3) or (n, 6) [m], one of each visit."""
     return data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
 
@@ -86,12 +91,12 @@ def _targets(data: Measurements) -> str:
     return f"{count} received powers"
 
 
-def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
+def describe_spacing(positions: np.ndarray, wavelength: float | None) -> str:
     """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
     different, counts = np.unique(positions, axis=0, return_counts=True)
     if len(different) < 2:
         return "one place alone"
-    distance, same = between(different), int(counts[counts > 1].sum())
+    distance, same = nearest_neighbour_distance(different), int(counts[counts > 1].sum())
     text = f"the nearest other place is {distance:.3g} m away (median)"
     text += "" if wavelength is None else f", {distance / wavelength:.2g} wavelengths"
     return text + (f"; {same} rows share their place with another" if same else "")
@@ -107,7 +112,7 @@ def _static(site: Site) -> str:
         lost = len(stations) - len(known)
         where = _box(known) if len(known) else ""
         where += f", {lost} of them at unknown places" if lost else ""
-        return f"the {end}, {len(stations)} stations{where}: {some(stations.name, 4)}"
+        return f"the {end}, {len(stations)} stations{where}: {list_first(stations.name, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
@@ -171,7 +176,7 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
         how = "then give them as latitude and longitude"
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
-    groups = outliers.two_groups(positions[:, :2])
+    groups = outliers.find_gap(positions[:, :2])
     if groups is not None:
         by = f", as column {zones!r} says" if zones else ""
         said = f"two groups of places {groups[1] / 1e3:.4g} km apart{by}"
@@ -208,7 +213,7 @@ ROUND = (1.0, 2.0, 3.0, 5.0, 10.0)
 APART = 3.0  # least side of a square, in distances of neighbours
 
 
-def side_of_squares(data: Measurements) -> float | None:
+def propose_block_side(data: Measurements) -> float | None:
     """Return a side [m] for `split=blocks`: a tenth of the site, several neighbours wide, round.
 
     None where the places are too few to hold squares of them out.
@@ -217,14 +222,14 @@ def side_of_squares(data: Measurements) -> float | None:
     extent = float(np.ptp(places, axis=0).max())
     if extent == 0:
         return None
-    least = max(extent / 10, APART * between(places))
+    least = max(extent / 10, APART * nearest_neighbour_distance(places))
     decade = 10 ** np.floor(np.log10(least))
     # At 0.99 a least side of 2.01 m still may be 2 m.
     side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)
     return side if side < extent / 2 else None
 
 
-def held_out(data: Measurements, side: float) -> np.ndarray:
+def rows_in_test_blocks(data: Measurements, side: float) -> np.ndarray:
     """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
@@ -234,10 +239,10 @@ def held_out(data: Measurements, side: float) -> np.ndarray:
     return split.folds[0].test
 
 
-def proposal(data: Measurements) -> str:
+def propose_split(data: Measurements) -> str:
     """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
-    side = side_of_squares(data)
-    if side is None or not len(held_out(data, side)):
+    side = propose_block_side(data)
+    if side is None or not len(rows_in_test_blocks(data, side)):
         return f"{between}; too few places to hold out squares of floor"
     return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"

@@ -40,7 +40,7 @@ class LevelStep:
     sigmas: float
 
 
-def level_steps(
+def detect_level_steps(
     position: np.ndarray,
     level_db: np.ndarray,
     station_position: np.ndarray | None = None,

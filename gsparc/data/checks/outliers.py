@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gsparc.data.blocks import blocks
-from gsparc.data.errors import some
+from gsparc.data.blocks import row_blocks
+from gsparc.data.errors import list_first
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Measurements
 
@@ -37,7 +37,7 @@ def too_far(positions: np.ndarray) -> np.ndarray:
     return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
 
 
-def two_groups(places: np.ndarray) -> tuple[np.ndarray, float] | None:
+def find_gap(places: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return which places (n, 2) [m] lie beyond a gap, (n,) bool, and how wide it is [m].
 
     None unless the gap is ten times as wide as the places on either side, which are not few.
@@ -64,18 +64,18 @@ def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.n
     return np.zeros(len(values), bool)
 
 
-def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+def peak_magnitudes(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Return the largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
     highest = []
-    for part in blocks(values):
+    for part in row_blocks(values):
         magnitude = np.abs(values[part] if mask is None else np.where(mask[part], values[part], 0))
         highest.append(magnitude.reshape(len(magnitude), -1).max(axis=1, initial=0))
     return np.concatenate(highest)
 
 
-def outliers(data: Measurements) -> dict[str, np.ndarray]:
+def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
     """Return rows (n,) by what is wrong with them."""
-    amplitude = peaks(data.target, data.mask)
+    amplitude = peak_magnitudes(data.target, data.mask)
     amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
     rows_by_fault = {
         "measure far more power than all others": np.flatnonzero(too_strong(amplitude)),
@@ -84,11 +84,11 @@ def outliers(data: Measurements) -> dict[str, np.ndarray]:
     return {what: rows for what, rows in rows_by_fault.items() if len(rows)}
 
 
-def warnings(data: Measurements) -> list[str]:
+def outlier_warnings(data: Measurements) -> list[str]:
     """Say each kind of outlier in one sentence, with the names of the first rows."""
     sentences = []
-    for what, rows in outliers(data).items():
-        names = some([data.row_names[i] for i in rows])
+    for what, rows in find_outliers(data).items():
+        names = list_first([data.row_names[i] for i in rows])
         sentences.append(f"{names}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
     return sentences
 
@@ -98,7 +98,7 @@ DISTANT_M, TOO_DISTANT_M = 1e4, 1e6  # from there on positions in float32 move i
 APART_M = 200.0  # in height, between a station and all rows
 
 
-def far_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None) -> tuple[str, bool]:
+def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None) -> tuple[str, bool]:
     """Say what is wrong with the places of static ends, empty: nothing, and whether that is certain.
 
     Args:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
-from gsparc.data.errors import some
+from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
+from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 
 NAMED = 5  # wild rows that a station may have, however few its rows
@@ -28,7 +28,6 @@ NEIGHBOURS = 5  # rows on each side
 LONG_GAP = 20  # rows without a value in one piece
 EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
-RISE = 0.3  # correlation of level and logarithm of the distance
 WEAK_DB = 6.0  # above the weakest value: heard only just
 
 
@@ -37,10 +36,15 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
 
     Args:
         levels: of powers.
-        steps: `steps_of` them.
+        steps: `find_level_steps` them.
     """
-    warnings = level_warnings(levels.level_db) + direction_warnings(levels) + copies(levels)
-    return [*warnings, *wild_rows(levels), *changed_levels(levels, steps), *gaps(levels)]
+    warnings = level_warnings(levels.level_db) + duplicate_warnings(levels)
+    return [
+        *warnings,
+        *outlier_row_warnings(levels),
+        *level_step_warnings(levels, steps),
+        *gap_warnings(levels),
+    ]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -71,28 +75,23 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
         values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
-    if low >= 0 and high <= 1:
-        said = f"all levels lie between {low:g} and {high:g}"
-        warnings.append(f"{said}: linear power? then give it as rssi, in W")
-    elif high > HIGHEST_DBM and low >= 0:
-        said = f"levels from {low:g} to {high:g} are all positive"
-        warnings.append(f"{said}: losses, percent, or linear? expected dBm")
-    elif high > HIGHEST_DBM:
+    if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
-    elif low >= 0 and (values % 1 == 0).all():
-        warnings.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
+    elif low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
+        said = f"no level of {low:g} to {high:g} is below 0"
+        warnings.append(f"{said}: losses, per cent, an index, or linear (then give it as rssi, in W)?")
     return warnings
 
 
-def saturation(values: np.ndarray) -> float | None:
+def find_saturation(values: np.ndarray) -> float | None:
     """Return the highest of levels (n,) where it repeats as no level of a receiver does by chance."""
     different, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     piled = len(counts) > 1 and counts[-1] > max(SATURATED * counts.sum(), 10, 5 * counts[-2])
     return float(different[-1]) if piled else None
 
 
-def not_heard(values: np.ndarray) -> list[float]:
+def find_not_heard_marks(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
     At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
@@ -118,32 +117,7 @@ def not_heard(values: np.ndarray) -> list[float]:
         rest = rest[~np.isin(rest, found)]
 
 
-def direction_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of levels that rise with the distance."""
-    if levels.station_position is None:
-        return []
-    rise = _correlation(levels, levels.station_position)
-    if rise <= RISE:
-        return []
-    return [
-        f"levels rise with distance (correlation {rise:.2f}): losses instead of levels (then say "
-        "dataset.columns.rssi_db=HEAD*-1), or are the stations, or x and y, elsewhere?"
-    ]
-
-
-def _correlation(levels: LinkLevels, places: np.ndarray) -> float:
-    """Of level and logarithm of the distance from stations at `places` (T, 2 or 3), median of stations."""
-    away = levels.position[:, : places.shape[1]] - places[levels.station]
-    spread = np.log10(np.maximum(np.linalg.norm(away, axis=1), 1e-3))
-    found = []
-    for _, used in levels.heard():
-        level = levels.level_db[used]
-        if len(used) >= 20 and np.ptp(spread[used]) > 0.3 and np.ptp(level) > 0:
-            found.append(np.corrcoef(spread[used], level)[0, 1])
-    return float(np.median(found)) if found else 0.0
-
-
-def copies(levels: LinkLevels) -> list[str]:
+def duplicate_warnings(levels: LinkLevels) -> list[str]:
     """Warn of rows of one place and station: copies of equal value, repeated measurements else."""
     import pandas as pd  # here, as it takes half a second
 
@@ -156,7 +130,7 @@ def copies(levels: LinkLevels) -> list[str]:
     warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        warnings.append(f"copies (same place, station and level): {some(same)}; leave them out")
+        warnings.append(f"copies (same place, station and level): {list_first(same)}; leave them out")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
         warnings.append(
@@ -166,18 +140,18 @@ def copies(levels: LinkLevels) -> list[str]:
     return warnings
 
 
-def wild_rows(levels: LinkLevels) -> list[str]:
+def outlier_row_warnings(levels: LinkLevels) -> list[str]:
     """Warn of single rows whose level is far from those before and after them at the same station."""
     warnings = []
-    for t, bad, most in wild_of(levels):
+    for t, bad, most in find_outlier_rows(levels):
         where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
-        rows = some([levels.rows[i] for i in bad])
+        rows = list_first([levels.rows[i] for i in bad])
         warnings.append(f"{where}{rows}: up to {most:.0f} dB from the rows around; wrong?")
     return warnings
 
 
-def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
-    """Return (station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
+def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
+    """Return (station, rows (k,), largest difference [dB]) of rows far from those around them."""
     outliers = []
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
@@ -194,7 +168,7 @@ def wild_of(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]:
     return outliers
 
 
-def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+def level_step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Warn of stations whose level changes at a row, unexplained by places (`level_steps`)."""
     names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
@@ -212,7 +186,7 @@ def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -
     return warnings
 
 
-def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
+def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Return stations and their steps, which name rows of `levels`."""
     steps = []
     stations = np.unique(levels.station)
@@ -221,12 +195,12 @@ def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
         used = np.flatnonzero(levels.station == t)
         where = None if levels.station_position is None else levels.station_position[t]
         where = where if where is not None and np.isfinite(where).all() else None
-        for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
+        for step in detect_level_steps(levels.position[used], levels.level_db[used], where, blocks):
             steps.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return steps
 
 
-def gaps(levels: LinkLevels) -> list[str]:
+def gap_warnings(levels: LinkLevels) -> list[str]:
     """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
 
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
@@ -278,7 +252,7 @@ def gaps(levels: LinkLevels) -> list[str]:
 
 
 def _of(who: list[str], total: int) -> str:
-    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {some(who)}"
+    return "" if total == 1 else f" of station{'s' * (len(who) > 1)} {list_first(who)}"
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,19 @@ truth. Every prediction therefore uses a fresh uplink of the same snapshot, if o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import centred, rounded_rms
-from gsparc.data.datasets.campaign import Release, StandIn, read_split, simulated
-from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.assemble import centre_positions, rounded_rms
+from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
+from gsparc.data.errors import DataError, Problems, explain_error
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.own_checks import Checker
-from gsparc.data.position_encoder import EncoderSettings, encoder_for
+from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
 
@@ -31,12 +31,9 @@ TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
 FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets are rebuilt
 
-Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
 
 def load_argos(
     root: str | Path,
-    encoder: Encoder | None = None,
     *,
     antenna: int | str = 0,
     positions: str | bool = "encoder",
@@ -46,9 +43,9 @@ def load_argos(
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
-        encoder: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
-        positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
+        positions: `encoder`, those of `encode_positions` by the training rows, or `true` where the folder has
+            `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
             offsets of the snapshot; a factor of modulus 1 changes no error.
 
@@ -65,7 +62,7 @@ def load_argos(
     spacing = float(description.get("spacing_hz", SPACING_HZ))
     carrier = float(description.get("carrier_hz", CARRIER_HZ))
     if align:
-        csi = aligned(csi, tones)
+        csi = remove_uplink_offsets(csi, tones)
     scale = rounded_rms(csi)
     # In complex128, as the reciprocal of a small scale overflows in complex64.
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
@@ -73,7 +70,7 @@ def load_argos(
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
-    where = _places(root, positions, encoder, uplink, split)
+    where = _places(root, positions, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
     facts = {name: str(description[name]) for name in FACTS if name in description}
@@ -83,7 +80,7 @@ def load_argos(
         stand_in="argos" if simulated else None, target_scale=scale, uplink_array=places - base,
         uplink_hz=frequency[:UPLINK], antennas=chosen,
     )  # fmt: skip
-    return centred(Measurements(
+    return centre_positions(Measurements(
         site, np.tile(base, (len(csi), 1)), where, np.tile(np.eye(3), (len(csi), 1, 1)), target,
         noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
         row_names=[f"snapshot {i}" for i in range(len(csi))], release_split=split,
@@ -92,7 +89,7 @@ def load_argos(
     ))  # fmt: skip
 
 
-def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
+def remove_uplink_offsets(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
     """Return snapshots (S, A, K) without mean delay and phase of their uplink (its tones come first)."""
     uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
     step = np.diff(numbers)[0]
@@ -129,13 +126,13 @@ def _loaded(path: Path, expected: str) -> np.ndarray:
     except FileNotFoundError:
         raise DataError(f"{path}: missing; {expected}") from None
     except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable ({reason(error)})") from None
+        raise DataError(f"{path}: not readable ({explain_error(error)})") from None
 
 
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
     # One description may hold the antennas of the files of 8 and of 64.
     key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
-    places = finite(description.get(key))
+    places = finite_array(description.get(key))
     if places.shape != (count, 3):
         raise DataError(
             f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
@@ -152,14 +149,14 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
     return np.array([antenna])
 
 
-def _places(root: Path, of: str, code: Encoder | None, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
+def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
         return _true_positions(root / "positions.npy", len(up))
-    if of != "encoder" or code is None:
+    if of != "encoder":
         raise DataError(f"dataset.positions={of!r}: expected encoder or true")
     # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
     rows = np.arange(len(up)) if split is None else split[0]
-    return code(up, rows)
+    return encode_positions(up, rows)
 
 
 def _true_positions(path: Path, rows: int) -> np.ndarray:
@@ -172,27 +169,10 @@ def _true_positions(path: Path, rows: int) -> np.ndarray:
 
 
 class Argos(Release):
-    """The Argos release or any folder in its layout.
-
-    Args:
-        root, **rest: see `Release` and `load_argos`.
-        encoder: `file` or `folder`, and `EncoderSettings`.
-    """
+    """The Argos release or any folder in its layout; settings of `load_argos` and `Release`."""
 
     called, reader = "Argos", staticmethod(load_argos)
     hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
-
-    def __init__(
-        self, root: str | Path | None = None, encoder: Mapping[str, Any] | None = None, **rest: Any
-    ) -> None:
-        settings = dict(encoder or {})
-        file, room = settings.pop("file", None), Path(settings.pop("folder", "outputs/encoders"))
-        super().__init__(root, **rest)
-        self.encoder = (room, EncoderSettings(**settings), file)
-
-    def read(self, folder: Path) -> Measurements:
-        """Read downlink channels (S, A, 26) complex64 with the uplink of the same snapshots."""
-        return load_argos(folder, encoder_for(*self.encoder), **self.settings)
 
 
 class ArgosSim(Argos):
@@ -206,4 +186,4 @@ class ArgosSim(Argos):
     def load(self) -> Measurements:
         """Load as `Argos.load` does, without a word about the release."""
         assert self.stand_in is not None
-        return simulated(self.stand_in, self.called, self.read)
+        return load_stand_in(self.stand_in, self.called, self.read)

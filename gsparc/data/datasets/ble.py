@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, converted
+from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text
 from gsparc.data.raw import Raw
@@ -26,7 +26,7 @@ NPZ = {
 }
 
 
-def raw_of_ble(path: str | Path, hall: int = 1) -> Raw:
+def read_ble(path: str | Path, hall: int = 1) -> Raw:
     """Read a folder of the release, or an npz; NaN is no value.
 
     Args:
@@ -40,11 +40,11 @@ def raw_of_ble(path: str | Path, hall: int = 1) -> Raw:
     Raises:
         DataError: no such file, or an array is missing, or a line is none of the release.
     """
-    return _of_release(Path(path), hall) if Path(path).is_dir() else converted(path, NPZ, layout="ble")
+    return _of_release(Path(path), hall) if Path(path).is_dir() else read_converted(path, NPZ, layout="ble")
 
 
 def _of_release(root: Path, hall: int) -> Raw:
-    sensors, folder = sensor_places(root / "cnf" / "tetam.dev"), root / "hst" / f"set_{hall}"
+    sensors, folder = read_sensor_places(root / "cnf" / "tetam.dev"), root / "hst" / f"set_{hall}"
     problems, levels = Problems(root), dict[tuple[str, str], float]()
     for file in sorted(folder.glob("*.mbd")):
         name, _, place = file.stem.partition("_")
@@ -52,7 +52,7 @@ def _of_release(root: Path, hall: int) -> Raw:
             problems.add(file, f"no sensor of cnf/tetam.dev is called {name!r}")
         elif len(_numbers(place.split("_"))) != 3:
             problems.add(file, "expected a name like sensor10_X_Y_Z.mbd with a place in metres")
-        elif (mean := problems.attempt(lambda file=file: mean_level(file))) is not None:  # type: ignore[misc]
+        elif (mean := problems.attempt(lambda file=file: read_mean_level(file))) is not None:  # type: ignore[misc]
             levels[name, place] = mean
     problems.raise_if_any()
     if not levels:
@@ -69,7 +69,7 @@ def _of_release(root: Path, hall: int) -> Raw:
     return Raw(arrays, {"layout": "ble"})
 
 
-def sensor_places(path: Path) -> dict[str, np.ndarray]:
+def read_sensor_places(path: Path) -> dict[str, np.ndarray]:
     """Return places (3,) [m] of the sensors by name, out of `tetam.dev`; DataError where it is another."""
     expected = 'expected a first line Dongles:{"ADDRESS": [[x, y, z], COLOUR, "NAME"], ...}'
     head = read_text(path, f"missing; {expected}").partition("\n")[0]
@@ -82,7 +82,7 @@ def sensor_places(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}, line 1: {expected}") from None
 
 
-def mean_level(path: Path) -> float:
+def read_mean_level(path: Path) -> float:
     """Mean level [dBm] of the packets of one sensor at one place; DataError where a line is no packet."""
     lines = read_text(path, "missing").splitlines()
     levels = _numbers([line.rpartition(",")[2] for line in lines])
@@ -101,7 +101,7 @@ def _numbers(words: list[str]) -> np.ndarray:
 
 
 class BLE(Campaign):
-    """Powers of a beacon at many places, at the sensors of a hall; settings of `raw_of_ble`, `Campaign`."""
+    """Powers of a beacon at many places, at the sensors of a hall; settings of `read_ble`, `Campaign`."""
 
-    choice, reader = "ble", staticmethod(raw_of_ble)
+    choice, reader = "ble", staticmethod(read_ble)
     inside, marks = "cnf/tetam.dev", frozenset({"mobile_position", "rssi_db"})

@@ -13,13 +13,13 @@ import numpy as np
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
-from gsparc.data.checks.plausibility import link_levels, plausibility_warnings, steps_of
+from gsparc.data.checks.plausibility import find_level_steps, link_levels, plausibility_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
-from gsparc.data.files import Several, read_text
+from gsparc.data.files import SeveralFiles, read_text
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
-from gsparc.data.public.fetch import fetched, found
+from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.data.raw import Raw, numbered_rows, read_raw
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
 from gsparc.data.selection import Selection
@@ -52,9 +52,9 @@ class Campaign(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
-        file = fetched(self.choice) if file in (None, "", "???") else file
-        one = str(file) if isinstance(file, str | Path) else Several(file)
-        whole = isinstance(one, Several) or "://" in one  # a path would make one of two slashes
+        file = fetched_path(self.choice) if file in (None, "", "???") else file
+        one = str(file) if isinstance(file, str | Path) else SeveralFiles(file)
+        whole = isinstance(one, SeveralFiles) or "://" in one  # a path would make one of two slashes
         self.file = one if whole else Path(one)
         part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
         self.settings, self.selection = settings, Selection(**part)
@@ -87,7 +87,11 @@ def _implausible(data: Measurements) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
-    return convention_warnings(data) if levels is None else plausibility_warnings(levels, steps_of(levels))
+    return (
+        convention_warnings(data)
+        if levels is None
+        else plausibility_warnings(levels, find_level_steps(levels))
+    )
 
 
 class StandIn(Protocol):
@@ -124,7 +128,7 @@ class Release(DataModule):
         **settings: Any,
     ) -> None:
         super().__init__(name or self.called.lower(), batch_size)
-        self.root = found(self.called.lower()) if root is None else Path(root)
+        self.root = fetched_path_or_none(self.called.lower()) if root is None else Path(root)
         self.stand_in, self.settings = stand_in, settings
 
     def missing(self) -> str:
@@ -143,10 +147,10 @@ class Release(DataModule):
         if self.root is not None or self.stand_in is None:
             raise DataError(self.missing())
         log.warning("%s Using the SIMULATED stand-in %s-sim instead.", self.missing(), self.called.lower())
-        return simulated(self.stand_in, self.called, self.read)
+        return load_stand_in(self.stand_in, self.called, self.read)
 
 
-def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurements]) -> Measurements:
+def load_stand_in(stand_in: StandIn, called: str, read: Callable[[Path], Measurements]) -> Measurements:
     """Return the measurements of what stands in for the release `called`."""
     folder = stand_in.folder()
     layout = f"{called.lower()}-sim: SIMULATED data in the layout of the {called} release"
@@ -154,7 +158,7 @@ def simulated(stand_in: StandIn, called: str, read: Callable[[Path], Measurement
     return read(folder)
 
 
-def made_once(folder: Path, write: Callable[[Path], None]) -> Path:
+def make_once(folder: Path, write: Callable[[Path], None]) -> Path:
     """Return the folder, written when it is not there yet."""
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -253,7 +257,7 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
     return {name: raw.arrays[name] for name in layout if name in raw.arrays}
 
 
-def converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
+def read_converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
     """Read arrays of an npz that was made of a release, by field of the schema.
 
     Args:

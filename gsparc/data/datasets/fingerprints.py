@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsparc.data.datasets.campaign import Expected, check_layout
-from gsparc.data.errors import DataError, nearest, reason, some
+from gsparc.data.errors import DataError, explain_error, list_first, suggest_nearest
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
@@ -69,7 +69,7 @@ class Fingerprints:
         column = {name: number for number, name in enumerate(self.access_point.tolist())}
         columns = np.array([column.get(name, -1) for name in names.tolist()])
         if not (columns >= 0).any():
-            raise DataError(f"no access point of {some(list(names))} is among {some([*column])}")
+            raise DataError(f"no access point of {list_first(list(names))} is among {list_first([*column])}")
         level = np.where(columns >= 0, self.level[:, columns], np.nan)
         return replace(self, level=level, access_point=names)
 
@@ -108,7 +108,9 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         numbers[NUMBERS[name]] = np.broadcast_to(array, count).astype(np.int64)
     names = checked.get("access_point", np.arange(level.shape[1])).astype(str)
     if len(np.unique(names)) < len(names):
-        raise DataError(f"{path}, access_point: a name twice in {some(list(names))}; expected each once")
+        raise DataError(
+            f"{path}, access_point: a name twice in {list_first(list(names))}; expected each once"
+        )
     return Fingerprints(
         level=level, position=np.pad(position, ((0, 0), (0, 3 - dimensions))), **numbers,
         test=checked.get("test", np.zeros(count)).astype(bool),
@@ -124,7 +126,7 @@ def _of_table(path: Path, placed: bool) -> Raw:
     try:
         frame = pd.read_csv(path, skipinitialspace=True)
     except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable as CSV text ({reason(error)})") from None
+        raise DataError(f"{path}: not readable as CSV text ({explain_error(error)})") from None
     names = [name for name in frame.columns if name.startswith("WAP")]
     places = ["LONGITUDE", "LATITUDE"] if placed or "LONGITUDE" in frame else []
     missing = [name for name in places if name not in frame] or ([] if names else ["WAP001"])
@@ -141,7 +143,7 @@ def _of_table(path: Path, placed: bool) -> Raw:
     return Raw({"rss_dbm": level, "access_point": np.array(names), **arrays})
 
 
-def parted(
+def split_fingerprints(
     rows: Fingerprints, how: How = "released", side_m: float = 1.0, share: float = 0.2, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Part rows into training and test (n,), (m,), sorted; a pure function of its arguments.
@@ -156,7 +158,7 @@ def parted(
         DataError: there is no such split, or one part of it is empty.
     """
     if how not in get_args(How):
-        hint = nearest(str(how), get_args(How))
+        hint = suggest_nearest(str(how), get_args(How))
         raise DataError(f"split: {how!r} is none of {', '.join(get_args(How))}{hint}")
     if how in ("released", "later"):
         test = rows.test if how == "released" else rows.campaign > rows.campaign.min()

@@ -16,14 +16,14 @@ import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.errors import DataError
-from gsparc.data.pickles import unpickled_frame
-from gsparc.data.raw import Raw, read_raw, renamed
+from gsparc.data.pickles import read_pickled_frame
+from gsparc.data.raw import Raw, read_raw, rename_arrays
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}
 COLUMNS = ("TxPos", "RxPos", "CSI", "Frequency", "LastXPts", "RxChanPerRay", "LineOfSight")
 
 
-def raw_of_newrf(path: str | Path) -> Raw:
+def read_newrf(path: str | Path) -> Raw:
     """Read a room of the release, or an npz, under the schema's names.
 
     Raises:
@@ -34,12 +34,12 @@ def raw_of_newrf(path: str | Path) -> Raw:
     missing = [name for name in (*NAMES, "csi", "frequency_hz") if name not in raw.arrays]
     if missing:
         raise DataError([f"{path}, {n}: missing; expected in the layout of NeWRF" for n in missing], path)
-    return renamed(raw, NAMES)
+    return rename_arrays(raw, NAMES)
 
 
 def _of_release(path: Path) -> dict[str, np.ndarray]:
     """The npz's arrays; rows with a value that is missing are left out, as the makers do."""
-    frame = unpickled_frame(path)
+    frame = read_pickled_frame(path)
     missing = [name for name in COLUMNS if name not in frame]
     if missing:
         raise DataError(f"{path}: no columns {', '.join(missing)}; it holds {', '.join(map(str, frame))}")
@@ -72,5 +72,5 @@ def _finite(value: object) -> bool:
 class NeWRF(Campaign):
     """One transmitter, many receivers, complex channels; settings of `Campaign`."""
 
-    choice, reader = "newrf", staticmethod(raw_of_newrf)
+    choice, reader = "newrf", staticmethod(read_newrf)
     marks, suffixes = frozenset(NAMES), (".pkl", ".pickle")

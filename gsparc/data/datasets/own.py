@@ -20,8 +20,8 @@ from gsparc.data.datasets.techtile_power import TechtilePower
 from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
 from gsparc.data.errors import Caution, DataError
-from gsparc.data.files import Several
-from gsparc.data.limits import choice, finite, or_null, switch
+from gsparc.data.files import SeveralFiles
+from gsparc.data.limits import choice, finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Noted, Raw, read_raw
 from gsparc.data.tables import is_table
@@ -29,7 +29,7 @@ from gsparc.data.tables import is_table
 log = logging.getLogger(__name__)
 
 
-def raw_of_own(
+def read_own(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
@@ -43,15 +43,15 @@ def raw_of_own(
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
         cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
-        **settings: see `understood`.
+        **settings: see `apply_settings`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
-        SettingError: see `understood`.
+        SettingError: see `apply_settings`.
     """
-    raw, notes = raw_of(path, columns, stations_file, cell_m)
-    raw = understood(raw, **settings)
-    campaign = choice_by_arrays(raw)
+    raw, notes = read_file_or_table(path, columns, stations_file, cell_m)
+    raw = apply_settings(raw, **settings)
+    campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
     for note in notes:
@@ -59,7 +59,7 @@ def raw_of_own(
     return raw
 
 
-def understood(
+def apply_settings(
     raw: Raw,
     not_heard: Sequence[float] | None = None,
     absent: str = "auto",
@@ -85,7 +85,9 @@ def understood(
         SettingError: another word for `absent`, or for a convention.
     """
     choice("auto", "unknown", "silent").check("dataset.absent", absent)
-    said: dict[str, Any] = {} if not_heard is None else {"not_heard": finite(not_heard).reshape(-1).tolist()}
+    said: dict[str, Any] = (
+        {} if not_heard is None else {"not_heard": finite_array(not_heard).reshape(-1).tolist()}
+    )
     said |= {} if absent == "auto" else {"absent": absent}
     said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
     for name, follows in conventions.items():
@@ -93,29 +95,29 @@ def understood(
     followed = [name for name, follows in conventions.items() if follows]
     said |= {"conventions": " ".join(followed)} if followed else {}
     given = {"tx_position": tx_position, "frequency_hz": frequency_hz}
-    arrays = {name: finite(value) for name, value in given.items() if value is not None}
+    arrays = {name: finite_array(value) for name, value in given.items() if value is not None}
     return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **said})
 
 
 class Own(Campaign):
-    """Measurements of one's own; suspicious units are warned of. Settings of `raw_of_own` and `Campaign`."""
+    """Measurements of one's own; suspicious units are warned of. Settings of `read_own` and `Campaign`."""
 
-    choice, reader = "own", staticmethod(raw_of_own)
-    # Arguments of `understood` but its data and its conventions, which are listed by name.
-    switches = tuple(inspect.signature(understood).parameters)[1:-1] + tuple(CONVENTIONS)
+    choice, reader = "own", staticmethod(read_own)
+    # Arguments of `apply_settings` but its data and its conventions, which are listed by name.
+    switches = tuple(inspect.signature(apply_settings).parameters)[1:-1] + tuple(CONVENTIONS)
 
 
 CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
 LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind in CAMPAIGNS}
 
 
-def choice_by_arrays(raw: Raw) -> str | None:
+def dataset_by_arrays(raw: Raw) -> str | None:
     """Return the choice of conf/dataset that reads a file with these arrays; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
     return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
-def choice_by_path(path: Path) -> str | None:
+def dataset_by_path(path: Path) -> str | None:
     """Return the choice of conf/dataset that reads a release, file or folder; None where none does."""
     folder = path.is_dir()
     for kind in CAMPAIGNS:
@@ -134,15 +136,15 @@ def read_any(
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `raw_of_own`.
-        **settings: see `understood`.
+        columns, stations_file: of a table, see `read_own`.
+        **settings: see `apply_settings`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
     # Releases before anything else: their folders may hold tables that look like one's own.
-    release = choice_by_path(path)
+    release = dataset_by_path(path)
     if release is not None:
         raw, notes = Noted(LOADERS[release](path), (f"this is the release of dataset={release}",))
     elif path.is_dir():
@@ -153,14 +155,14 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, notes = raw_of(path, columns, stations_file)
-        if (campaign := choice_by_arrays(raw)) is not None:
+        raw, notes = read_file_or_table(path, columns, stations_file)
+        if (campaign := dataset_by_arrays(raw)) is not None:
             raw, notes = Noted(LOADERS[campaign](path), (f"this is a file of dataset={campaign}",))
-    reading = interpret(understood(raw, **settings), path)
+    reading = interpret(apply_settings(raw, **settings), path)
     return Reading(reading.data, (*notes, *reading.notes))
 
 
-def raw_of(
+def read_file_or_table(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
@@ -172,7 +174,7 @@ def raw_of(
         DataError: not readable, or columns that nothing can be made of.
     """
     # Columns of tables are matched by their heads; arrays of several files may differ in every shape.
-    if isinstance(path, Several) and not (cell_m is None and all(is_table(one) for one in path.paths)):
+    if isinstance(path, SeveralFiles) and not (cell_m is None and all(is_table(one) for one in path.paths)):
         raise DataError(f"{path}: several files are read as one where all are tables, without dataset.cell_m")
     if cell_m is None and not is_table(path):
         named = any(value is not None for value in (columns or {}).values())

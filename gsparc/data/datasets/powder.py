@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, converted
-from gsparc.data.errors import DataError, Problems, shortened
+from gsparc.data.datasets.campaign import Campaign, read_converted
+from gsparc.data.errors import DataError, Problems, shorten
 from gsparc.data.files import read_text
-from gsparc.data.limits import finite, number
+from gsparc.data.limits import finite_array, number
 from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw
 
@@ -37,7 +37,7 @@ NPZ = {
 }
 
 
-def raw_of_powder(
+def read_powder(
     path: str | Path,
     station_table: str | Path | None = None,
     tx_height: float = WALKER_M,
@@ -71,7 +71,7 @@ def raw_of_powder(
 
 
 def _of_npz(path: Path) -> Raw:
-    raw = converted(path, NPZ)
+    raw = read_converted(path, NPZ)
     places, stations = raw.arrays.pop("tx_position"), raw.arrays.pop("station_position")
     degrees = np.stack([raw.arrays["latitude"], raw.arrays["longitude"]], axis=1)
     # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.
@@ -83,10 +83,10 @@ def _of_npz(path: Path) -> Raw:
 
 def _of_csv(path: Path, table: Path) -> Raw:
     from gsparc.data.tables.columns import Column  # here, as pandas takes half a second to import
-    from gsparc.data.tables.opening import sheet_of
-    from gsparc.data.tables.places import places
+    from gsparc.data.tables.opening import read_sheet
+    from gsparc.data.tables.places import read_places
 
-    (sheet, _), stations = sheet_of(path), station_places(table)
+    (sheet, _), stations = read_sheet(path), read_station_places(table)
     missing = [head for head in (LATITUDE, LONGITUDE) if head not in sheet.heads]
     if missing:
         raise DataError(f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv")
@@ -98,14 +98,14 @@ def _of_csv(path: Path, table: Path) -> Raw:
     if not columns:
         example = next(iter(stations), "none")
         raise DataError(f"{path}, line 1: no column is a station of {table}, e.g. {example}")
-    walk, levels = places(sheet, chosen, "tx_"), [sheet.numbers(name) for name in columns]
+    walk, levels = read_places(sheet, chosen, "tx_"), [sheet.numbers(name) for name in columns]
     sheet.problems.raise_if_any()
     assert walk is not None
     rssi = np.stack([level for level in levels if level is not None], axis=1)
     rest = [head for head in sheet.heads if head not in (*columns, LATITUDE, LONGITUDE, TIME)]
     about = {}
     if rest:
-        about["left_out"] = shortened(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
+        about["left_out"] = shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
     where = np.array([stations[name] for name in columns])
     arrays = {
         "latitude": walk.across[:, 0], "longitude": walk.across[:, 1],
@@ -117,7 +117,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
     return Raw(arrays, about)
 
 
-def station_places(path: Path) -> dict[str, tuple[float, float]]:
+def read_station_places(path: Path) -> dict[str, tuple[float, float]]:
     """Return latitude and longitude [deg] of the stations that stay put, by name.
 
     Args:
@@ -136,7 +136,7 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
         raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
     problems, places = Problems(path), {}
     for name, value in content.items():
-        degrees = finite(value)
+        degrees = finite_array(value)
         if value is not None and degrees.shape != (2,):
             problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
         elif value is not None and (fault := bad_degrees(*degrees)):
@@ -150,7 +150,7 @@ def station_places(path: Path) -> dict[str, tuple[float, float]]:
 
 
 class Powder(Campaign):
-    """Powers of a walking transmitter at fixed stations; settings of `raw_of_powder` and of `Campaign`."""
+    """Powers of a walking transmitter at fixed stations; settings of `read_powder` and of `Campaign`."""
 
-    choice, reader = "powder", staticmethod(raw_of_powder)
+    choice, reader = "powder", staticmethod(read_powder)
     marks = frozenset({"mobile_position", "latitude"})

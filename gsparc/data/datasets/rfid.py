@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsparc.data.assemble import centred, check_positions
-from gsparc.data.blocks import empty
+from gsparc.data.assemble import centre_positions, check_positions
+from gsparc.data.blocks import allocate
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.own_checks import is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements, Site, TrainTest
 from gsparc.ops import SphereGrid
@@ -94,7 +94,7 @@ def load_rfid(
         stand_in="rfid" if simulated else None,
     )  # fmt: skip
     rx, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, info.rotation))
-    return centred(Measurements(
+    return centre_positions(Measurements(
         site, positions[rows], rx, rotation, spectra if listed is None else spectra[rows],
         row_names=[f"spectrum/{i + 1:05d}.png" for i in rows], release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
@@ -117,9 +117,9 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
 
 def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
     """A table of these columns; `DataError` where it is none, or has others."""
-    from gsparc.data.tables.opening import sheet_of  # here, as pandas takes half a second to import
+    from gsparc.data.tables.opening import read_sheet  # here, as pandas takes half a second to import
 
-    sheet, _ = sheet_of(path, problems)
+    sheet, _ = read_sheet(path, problems)
     sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))
     if sorted(sheet.heads) != sorted(heads):
         found = ",".join(sheet.heads)
@@ -147,7 +147,7 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
         there = f"there are {', '.join(gateways)}" if gateways else f"no gateway in it; expected {entry}"
         return problems.add(path, f"no gateway named {name!r}; {there}")
     pose = [gateways[name].get(key) for key in ("position", "orientation")]
-    position, orientation = map(finite, pose)
+    position, orientation = map(finite_array, pose)
     if position.shape != (3,):
         problems.add(path, f"{name}: position is {pose[0]}; expected three finite numbers [m]")
     else:
@@ -187,7 +187,7 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     if missing:
         return None
     # On disk where it is large: the release's 6,123 spectra are 200 MB.
-    spectra = empty((count, HEIGHT, WIDTH), np.uint8)
+    spectra = allocate((count, HEIGHT, WIDTH), np.uint8)
     for i, name in enumerate(expected):
         fault = _read_image(folder / name, spectra[i])
         if fault:

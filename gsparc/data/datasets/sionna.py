@@ -11,8 +11,8 @@ import numpy as np
 
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
-from gsparc.data.own import interpreted
-from gsparc.data.raw import Raw, read_raw, renamed
+from gsparc.data.own import interpret_and_log
+from gsparc.data.raw import Raw, read_raw, rename_arrays
 from gsparc.data.schema import Measurements
 
 TARGETS = ("spectrum", "csi", "rssi")
@@ -81,10 +81,10 @@ def _load(path: str | Path, target: str | None) -> Measurements:
     present = [name for name in TARGETS if STORED[name] in raw.arrays]
     if target not in present:
         raise DataError(f"dataset.target={target}: {path} holds {' and '.join(present)}")
-    return interpreted(read_as(raw, target), path)
+    return interpret_and_log(select_measurement(raw, target), path)
 
 
-def read_as(raw: Raw, target: str) -> Raw:
+def select_measurement(raw: Raw, target: str) -> Raw:
     """Return the same file with one measurement, its array, noise and solver error."""
     other = [name for name in ("spectrum", "csi") if name != target]
     arrays = {k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")}
@@ -98,7 +98,7 @@ def read_as(raw: Raw, target: str) -> Raw:
         attributes["convergence_error"] = attributes["convergence_spectrum_nmse"]
     if target != "spectrum":
         attributes["normalisation"] = "none"
-    return renamed(Raw(arrays, attributes, raw.units), names)
+    return rename_arrays(Raw(arrays, attributes, raw.units), names)
 
 
 def _in_decibels(power: np.ndarray) -> dict[str, np.ndarray]:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, converted
+from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, read_converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf
 from gsparc.data.schema import FLAGS, LABELS, TEXT
 
@@ -46,7 +46,7 @@ RELEASE = {
 }
 
 
-def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
+def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
     """Read an npz, or a NetCDF file of the release.
 
     Args:
@@ -65,7 +65,7 @@ def raw_of_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw
     path = Path(path)
     if path.suffix.lower() in NETCDF_SUFFIXES:
         return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
-    return converted(path, NPZ, name="techtile", layout="techtile")
+    return read_converted(path, NPZ, name="techtile", layout="techtile")
 
 
 def _with_experiments(raw: Raw, path: Path) -> Raw:
@@ -85,7 +85,9 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
     hosts = variables["hostname"].astype(str)
     places = variables.get("rx_antenna_position")
     if places is None:
-        places = antenna_positions(path.with_name(ANTENNAS) if antennas is None else Path(antennas), hosts)
+        places = read_antenna_positions(
+            path.with_name(ANTENNAS) if antennas is None else Path(antennas), hosts
+        )
     # Stored is reference minus received phase: the conjugate of a channel that follows exp(-j k d).
     csi = variables["csi_real"].astype(np.float64) - 1j * variables["csi_imag"].astype(np.float64)
     heard = np.isfinite(csi) & (variables.get("csi_available", np.ones(csi.shape)) == 1)
@@ -114,7 +116,7 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
     return Raw(arrays, attributes)
 
 
-def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
+def read_antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
     """Return places (T, 3) float64 [m] of the receiving antennas of `hosts` (T,) from Techtile's table.
 
     Args:
@@ -140,7 +142,9 @@ def antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
 def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     channels: Any = entry.get("channels")
     try:
-        place = finite([channels[CHANNEL][axis] for axis in "xyz"])  # of a list, or of a table with numbers
+        place = finite_array(
+            [channels[CHANNEL][axis] for axis in "xyz"]
+        )  # of a list, or of a table with numbers
     except (TypeError, KeyError, IndexError):
         place = np.zeros(0)
     if not len(place):
@@ -149,7 +153,7 @@ def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
 
 
 class Techtile(Campaign):
-    """Channels of a moving transmitter at 42 antennas; settings of `raw_of_techtile` and of `Campaign`."""
+    """Channels of a moving transmitter at 42 antennas; settings of `read_techtile` and of `Campaign`."""
 
-    choice, reader = "techtile", staticmethod(raw_of_techtile)
+    choice, reader = "techtile", staticmethod(read_techtile)
     marks, suffixes = frozenset({"rx_antenna_position", "csi"}), NETCDF_SUFFIXES

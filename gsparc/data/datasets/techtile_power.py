@@ -15,7 +15,7 @@ import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.errors import DataError
-from gsparc.data.pickles import unpickled
+from gsparc.data.pickles import read_pickle
 from gsparc.data.raw import Raw, read_raw
 
 CARRIER_HZ = 920e6
@@ -23,7 +23,7 @@ PICOWATT_DB = -90.0  # relative to a milliwatt
 POSITIONS, VALUES = {"Positioner.PositionerValue"}, {"lib.ep.ep_data"}  # classes of the makers' recorder
 
 
-def raw_of_techtile_power(path: str | Path) -> Raw:
+def read_techtile_power(path: str | Path) -> Raw:
     """Read a folder of a run of the release, or an npz.
 
     Returns:
@@ -59,7 +59,7 @@ def _of_release(folder: Path) -> Raw:
 
 def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.ndarray:
     """Attributes (rows, names) of the objects in an array; DataError where one has none of them."""
-    held: Any = unpickled(path, classes, npy=True)
+    held: Any = read_pickle(path, classes, npy=True)
     try:
         return np.array([[float(one.state[name]) for name in names] for one in held])
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -69,5 +69,5 @@ def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.nda
 class TechtilePower(Campaign):
     """Received powers on a plane; settings of `Campaign`."""
 
-    choice, reader = "techtile_power", staticmethod(raw_of_techtile_power)
+    choice, reader = "techtile_power", staticmethod(read_techtile_power)
     inside = "*_positions.npy"

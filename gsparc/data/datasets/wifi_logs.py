@@ -1,4 +1,4 @@
-"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; ESP32 on no log of a card yet.
+"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300.
 
 `csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
 file that is not there ends the process. So lengths are looked at before it reads.
@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
-from gsparc.data.errors import DataError, reason
+from gsparc.data.errors import DataError, explain_error
 
-SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}
 HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
 TONES_40 = np.array([*range(-58, 0, 4), *range(2, 59, 4)])  # of 128 that it reports there
 STREAMS = 3  # most antennas at either end of the cards
@@ -51,12 +50,11 @@ class Packets:
     position: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> Packets:
+def read_packets(path: Path, chip: str = "43455c0") -> Packets:
     """Read the packets of a log.
 
     Args:
-        path: *.pcap of Nexmon, *.dat of an Intel 5300, or what `card` names.
-        card: `nexmon`, `intel` or `esp32`; None: by the file's ending.
+        path: *.pcap of Nexmon, or *.dat of an Intel 5300.
         chip: of Nexmon: `4339`, `43455c0`, `4358` or `4366c0`.
 
     Raises:
@@ -66,15 +64,15 @@ def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> 
         import csiread
     except ImportError:
         raise DataError(f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'") from None
-    card = card or SUFFIXES.get(path.suffix.lower())
-    if card not in READERS:
-        raise DataError(f"{path}: no log of a known card; say dataset.card={'|'.join(READERS)}")
+    if path.suffix.lower() not in READERS:
+        raise DataError(f"{path}: expected a log of Nexmon, *.pcap, or of an Intel 5300, *.dat")
+    card, read = READERS[path.suffix.lower()]
     try:
-        packets = READERS[card](path, csiread, chip)
+        packets = read(path, csiread, chip)
     except DataError:
         raise
     except Exception as error:  # `csiread` raises anything
-        raise DataError(f"{path}: not readable as a log of {card} ({reason(error)})") from None
+        raise DataError(f"{path}: not readable as a log of {card} ({explain_error(error)})") from None
     if not len(packets.csi):
         raise DataError(f"{path}: no packet with a channel in it; is it a log of {card}?")
     return packets
@@ -86,7 +84,7 @@ def channel_hz(channel: int) -> float:
     return 1e6 * (first + 5 * channel)
 
 
-def address(octets: np.ndarray) -> np.ndarray:
+def format_address(octets: np.ndarray) -> np.ndarray:
     """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
     return np.array([":".join(f"{octet:02x}" for octet in one) for one in octets], str)
 
@@ -107,7 +105,7 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     rssi = np.full(len(one), np.nan) if silent else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
     return Packets(
         log.sec[one] + log.usec[one] * (1e-9 if log.nano else 1e-6),
-        address(log.src_addr[one]),
+        format_address(log.src_addr[one]),
         log.csi[one, None],
         np.fft.fftfreq(points, 1 / points).round().astype(int),  # in the order of an FFT
         np.where(rssi < 0, rssi, np.nan),
@@ -134,8 +132,8 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     size = int.from_bytes(content[:2], "big")
     if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
         own = read_log(path)
-        power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1)
-        sender = address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
+        power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
+        sender = format_address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
         return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
     at, count = 0, 0
     while at + 2 < len(content):
@@ -158,13 +156,4 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     )
 
 
-def _esp32(path: Path, csiread: Any, _: str) -> Packets:
-    log = csiread.ESP32(str(path), if_report=False)
-    log.read()
-    tone = np.fft.fftfreq(64, 1 / 64).round().astype(int)  # of the legacy training field, which comes first
-    carrier = channel_hz(int(log.channel[0]))
-    csi = log.csi[:, None, :64]
-    return Packets(1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier)
-
-
-READERS = {"nexmon": _nexmon, "intel": _intel, "esp32": _esp32}
+READERS = {".pcap": ("Nexmon", _nexmon), ".dat": ("an Intel 5300", _intel)}

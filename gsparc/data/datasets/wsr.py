@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, converted
+from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_csv
 from gsparc.data.raw import Raw
@@ -57,7 +57,7 @@ class Log:
     csi: np.ndarray
 
 
-def raw_of_wsr(
+def read_wsr(
     path: str | Path, transmitters: Mapping[str, Sequence[float]] | None = None, spacing_m: float = 0.016
 ) -> Raw:
     """Read a folder of runs, or an npz.
@@ -77,7 +77,7 @@ def raw_of_wsr(
     path = Path(path)
     if path.is_dir():
         return _of_release(path, LOS_SET_A if transmitters is None else transmitters, spacing_m)
-    arrays = converted(path, NPZ).arrays
+    arrays = read_converted(path, NPZ).arrays
     arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("sign")
     good = arrays.pop("good")
     kept = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}
@@ -165,7 +165,7 @@ def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator
     place = np.stack([np.interp(robot.time[mine], way[:, 0], axis) for axis in way[:, 1:].T], axis=1)
     path = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     for part in np.split(np.arange(len(path)), np.flatnonzero(np.diff(path) > GAP_M) + 1):
-        root = followed(square[part])
+        root = follow_root(square[part])
         step = np.floor(path[part] / spacing_m)
         kept = np.flatnonzero(np.diff(step, prepend=step[:1]) > 0)
         kept = kept[(kept >= AVERAGED // 2) & (kept < len(part) - AVERAGED // 2)]
@@ -177,7 +177,7 @@ def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator
 def _square(robot: Log, other: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:
     """How well neighbours agree (at most 1), the robot's packets (n,), the square of the channel (n, 30)."""
     mine, theirs, late = _paired(robot, other, sender)
-    square = without_slope(robot.csi[mine, :, 0] * other.csi[theirs, :, 0])
+    square = remove_delay_slope(robot.csi[mine, :, 0] * other.csi[theirs, :, 0])
     turn, step = np.sum(square[1:] * square[:-1].conj(), axis=1), np.diff(late)
     offsets = np.arange(-MOST_OFFSET_HZ, MOST_OFFSET_HZ, OFFSET_STEP_HZ)  # of the two oscillators [Hz]
     agree = [np.real(np.sum(turn * np.exp(-2j * np.pi * hz * step))) for hz in offsets]
@@ -200,14 +200,14 @@ def _paired(robot: Log, other: Log, sender: np.void) -> tuple[np.ndarray, np.nda
     return here[mine], theirs, rest
 
 
-def without_slope(csi: np.ndarray) -> np.ndarray:
+def remove_delay_slope(csi: np.ndarray) -> np.ndarray:
     """Return channels (n, 30) without their phase's mean slope over tones, which holds the clocks' delay."""
     even = np.diff(TONES) == 2
     turn = np.angle(np.sum((csi[:, 1:] * csi[:, :-1].conj())[:, even], axis=1)) / 2
     return csi * np.exp(-1j * turn[:, None] * TONES)
 
 
-def followed(square: np.ndarray) -> np.ndarray:
+def follow_root(square: np.ndarray) -> np.ndarray:
     """Return the root (n, K) of a square that changes little from row to row and from tone to tone."""
     root = np.sqrt(square)
     for tone in range(1, root.shape[1]):
@@ -219,7 +219,7 @@ def followed(square: np.ndarray) -> np.ndarray:
 
 
 class WSR(Campaign):
-    """Channels of 30 tones of a robot that drives; settings of `raw_of_wsr` and `Campaign`."""
+    """Channels of 30 tones of a robot that drives; settings of `read_wsr` and `Campaign`."""
 
-    choice, reader = "wsr", staticmethod(raw_of_wsr)
+    choice, reader = "wsr", staticmethod(read_wsr)
     inside, marks = "**/csi_rx_*.dat", frozenset({"h2", "root_sign"})

@@ -18,7 +18,7 @@ FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
-def station_number(wanted: str | int, names: Sequence[str], count: int) -> int | None:
+def find_station(wanted: str | int, names: Sequence[str], count: int) -> int | None:
     """Return which of `count` stations a name, or, if none is called by a number, a number from 0 means.
 
     Args:
@@ -35,7 +35,7 @@ def station_number(wanted: str | int, names: Sequence[str], count: int) -> int |
     return numbers.index(str(wanted)) if str(wanted) in numbers else None
 
 
-def numbered(places: np.ndarray) -> np.ndarray:
+def number_places(places: np.ndarray) -> np.ndarray:
     """Number each of `places` (n, 3), (n,) int64, in the order in which they first appear."""
     _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
@@ -43,7 +43,7 @@ def numbered(places: np.ndarray) -> np.ndarray:
     return rank[which.reshape(-1)]
 
 
-def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
+def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
     """Find which end stands still, at one place or at few, whose rows are then numbered; None: both move."""
     ends: dict[End, np.ndarray] = {"tx": tx, "rx": rx}
     places = {end: np.unique(where, axis=0, return_inverse=True) for end, where in ends.items()}
@@ -55,11 +55,11 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
         return Links(None)
     check.notes.append(f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations")
     check.raw.arrays["station"] = which.reshape(-1).astype(np.int64)
-    check.raw.arrays["place"] = numbered(ends[OTHER[few]])
+    check.raw.arrays["place"] = number_places(ends[OTHER[few]])
     return Links(few, Stations(table, tuple(str(i) for i in range(len(table)))))
 
 
-def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
+def read_station_table(check: Checker, may_miss: bool = False) -> Stations | None:
     """Read the table that a file gives; None where something is wrong with it (noted).
 
     Places may be missing, NaN throughout, where powers or channels alone are told by the stations.
@@ -75,9 +75,10 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
         return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
     count = len(places)
     places[lost] = np.nan
-    names = check.raw.arrays.get("station_name")
-    if names is not None and not check.fits("station_name", names, (count,)):
-        return None
+    names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))
+    for what, texts in (("station_name", names), ("station_label", label)):
+        if texts is not None and not check.fits(what, texts, (count,)):
+            return None
     called = tuple(map(str, range(count) if names is None else names))
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
@@ -92,10 +93,11 @@ def station_table(check: Checker, may_miss: bool = False) -> Stations | None:
         wrong = np.abs(sector[:, :4]).max(initial=0, where=np.isfinite(sector[:, :4]))
         if wrong > FULL_TURN:
             return check.refuse("station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}")
-    return Stations(places, called, rotation, sector=sector)
+    shown = None if label is None else tuple(map(str, label))
+    return Stations(places, called, rotation, sector=sector, label=shown)
 
 
-def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
+def read_station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
     """Return the station (S,) int64 of every row."""
     index = check.array("station", (rows,))
     if index is None:
@@ -129,7 +131,7 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 
 
-def by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stations:
+def split_by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stations:
     """Part stations at several carriers, one for each; where `hopping`, carriers of a band are one."""
     arrays = check.raw.arrays
     carrier = arrays.get("carrier_hz")

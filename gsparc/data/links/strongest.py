@@ -23,7 +23,7 @@ NEAREST_M = 20.0  # to a station: nearer, levels rise no more
 SHADOWING_DB, ALIKE_M = 10.0, 100.0  # deviation of levels far apart, and what is not far
 
 
-def moments(place: np.ndarray, station: np.ndarray) -> np.ndarray:
+def number_lists(place: np.ndarray, station: np.ndarray) -> np.ndarray:
     """Number (n,) of the list that each row belongs to: rows of one place, in the file's order.
 
     Args:
@@ -46,7 +46,7 @@ Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Lists:
+class StrongestLists:
     """Lists of the strongest of T stations.
 
     Attributes:
@@ -62,7 +62,9 @@ class Lists:
     place: np.ndarray
 
     @classmethod
-    def of(cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int) -> Lists:
+    def of(
+        cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int
+    ) -> StrongestLists:
         """Build from rows (n,) of `lists`, stations `who` of `count`, levels [dB], places `at` (n, 3) [m]."""
         number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)

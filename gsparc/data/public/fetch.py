@@ -14,8 +14,8 @@ from urllib.parse import quote
 import yaml
 from filelock import FileLock
 
-from gsparc.data.errors import DataError, nearest, reason
-from gsparc.data.files import platform_cache, shipped
+from gsparc.data.errors import DataError, explain_error, suggest_nearest
+from gsparc.data.files import platform_cache, read_shipped_table
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ class PublicSet:
 def public_sets() -> dict[str, PublicSet]:
     """Return every public set by its name."""
     sources: dict[str, list[Source]] = {}
-    for row in shipped("gsparc.data.public", "sources.csv"):
+    for row in read_shipped_table("gsparc.data.public", "sources.csv"):
         place = row["repository"], row["revision"], row["path"]
         sources.setdefault(row["dataset"], []).append(Source(*place, int(row["bytes"]), row["sha256"]))
     about = yaml.safe_load(files("gsparc.data.public").joinpath("sets.yaml").read_text(encoding="utf-8"))
@@ -105,7 +105,7 @@ def public_sets() -> dict[str, PublicSet]:
     return sets
 
 
-def fetched(choice: str, setting: str = "file") -> Path:
+def fetched_path(choice: str, setting: str = "file") -> Path:
     """Return what `dataset=<choice>` reads where its setting names nothing: the set as it was fetched.
 
     Raises:
@@ -124,10 +124,10 @@ def fetched(choice: str, setting: str = "file") -> Path:
     raise DataError(f"dataset.{setting} is not set; {how}, or {say}")
 
 
-def found(choice: str) -> Path | None:
-    """Return the same as `fetched`; None where it is not there."""
+def fetched_path_or_none(choice: str) -> Path | None:
+    """Return the same as `fetched_path`; None where it is not there."""
     try:
-        return fetched(choice)
+        return fetched_path(choice)
     except DataError:
         return None
 
@@ -146,7 +146,9 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
     """
     known = public_sets()
     if name not in known:
-        raise DataError(f"no public set is called {name!r}{nearest(name, known)}; `gsparc data` lists them")
+        raise DataError(
+            f"no public set is called {name!r}{suggest_nearest(name, known)}; `gsparc data` lists them"
+        )
     wanted = known[name]
     if not wanted.sources:
         raise DataError(f"{name} is not fetched by this program; get it from {wanted.by_hand}")
@@ -162,7 +164,7 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
                 stray.unlink()
             _fetch_files(wanted, timeout_s, retries)
     except OSError as error:
-        why = error.strerror or reason(error)
+        why = error.strerror or explain_error(error)
         fault = f"cannot be written ({why}); set XDG_CACHE_HOME to a folder that can"
         raise DataError(f"{wanted.folder}: {fault}") from None
     return wanted.folder
@@ -218,7 +220,7 @@ def _fault(source: Source, error: Exception, name: str) -> str:
 
     again = f"what is there is kept: say `gsparc data {name}` again"
     if isinstance(error, requests.HTTPError | requests.TooManyRedirects):
-        return f"{source.url}: {reason(error).partition(' for url')[0]}; {again}"
+        return f"{source.url}: {explain_error(error).partition(' for url')[0]}; {again}"
     if "timed out" in str(error):
         return f"{source.url}: the server sends nothing; {again}"
     if isinstance(error, requests.exceptions.ChunkedEncodingError) or "IncompleteRead" in str(error):

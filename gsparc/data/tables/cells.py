@@ -10,7 +10,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE
 from gsparc.data.tables.columns import Chosen, Column
 from gsparc.data.tables.heads import AXES, KINDS
-from gsparc.data.tables.opening import opened
+from gsparc.data.tables.opening import open_parquet
 from gsparc.data.tables.sheet import Sheet
 
 LOOKED_AT = 10_000  # rows by which columns are understood
@@ -19,7 +19,7 @@ ENDS = ("", "rx_", "tx_")
 CHUNK = {"batch_readahead": 2, "fragment_readahead": 1}  # of 131,072 rows and of files: memory
 
 
-def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
+def merge_cells(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
     """Merge rows by cell of places and values of other columns: means of levels [dB] and coordinates.
 
     Rows without a level are apart from those with one, as they were not heard. Memory grows with cells, not
@@ -37,7 +37,7 @@ def merged(first: Sheet, chosen: Chosen, cell_m: float) -> Sheet:
     POSITIVE.check("dataset.cell_m", cell_m)
     if "rssi_db" not in chosen:
         raise DataError(f"{first.source}: dataset.cell_m merges levels; say dataset.columns.rssi_db=COLUMN")
-    with opened(first.source) as files:
+    with open_parquet(first.source) as files:
         from pyarrow import acero, compute
 
         wanted = {c.head: c for columns in chosen.values() for c in columns if c.head is not None}

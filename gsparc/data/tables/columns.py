@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, nearest, some
+from gsparc.data.errors import Caution, list_first, suggest_nearest
 from gsparc.data.tables import heads
-from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, suits, unit_of, words_of
+from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, unit_of, unit_suits, words_of
 from gsparc.data.tables.sheet import Sheet
-from gsparc.data.units import SCHEMA, UNITS, Unit, known
+from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
@@ -47,18 +47,18 @@ class Column(Head):
         """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
         if self.head is None:
             return np.full(len(sheet), self.value[0])
-        if self.unit is not None and not suits(self.role, self.unit):
-            wanted = f"one of {known(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+        if self.unit is not None and not unit_suits(self.role, self.unit):
+            wanted = f"one of {list_units(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
             remedy = heads.PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
         marks = self.role == "rssi_db"
-        return sheet.numbers(self.head, self.unit, lambda unit: suits(self.role, unit), marks)
+        return sheet.numbers(self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks)
 
 
 Chosen = dict[str, tuple[Column, ...]]
 
 
-def choose(
+def choose_columns(
     sheet: Sheet,
     settings: Mapping[str, object],
     labelled: Iterable[str] = (),
@@ -84,7 +84,7 @@ def choose(
     used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.understand(head) if head not in used_heads else Head()
+        meaning = heads.understand_head(head) if head not in used_heads else Head()
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
@@ -95,7 +95,7 @@ def choose(
         if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
             continue
         if meaning.strange:
-            expected = known(KINDS[role])
+            expected = list_units(KINDS[role])
             sheet.refuse(f"[{meaning.strange}] is no known unit; expected one of {expected}", head)
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     # First of all, as a second measurement is no second candidate for the first one.
@@ -136,7 +136,7 @@ def choose(
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {some(unused, 8)}")
+        notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}")
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
 
 
@@ -185,7 +185,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
     ends, have = set(heads.END_WORDS), {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
     for head in sheet.heads:
         lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
-        topic = heads.about(head) or ("a station" if lone and ends & set(words_of(head)) else None)
+        topic = heads.topic_of(head) or ("a station" if lone and ends & set(words_of(head)) else None)
         if topic is None or head in used:
             if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
                 say = f"dataset.columns.z={head}*3.2 takes 3.2 m each"
@@ -209,7 +209,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
-        hint = nearest(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
+        hint = suggest_nearest(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
     head = _head(sheet, text)
@@ -239,7 +239,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
         return (Column(role, value=numbers),)
-    hint = nearest(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
+    hint = suggest_nearest(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
 
 
@@ -255,7 +255,7 @@ def _head(sheet: Sheet, text: str) -> str | None:
 
 def _unit(head: str, role: str) -> Unit | None:
     unit, words = unit_of(head)[1], words_of(head)
-    if unit is None and len(words) > 1 and words[-1] in UNITS and suits(role, UNITS[words[-1]]):
+    if unit is None and len(words) > 1 and words[-1] in UNITS and unit_suits(role, UNITS[words[-1]]):
         return UNITS[words[-1]]
     return unit
 
@@ -342,11 +342,11 @@ def _note(columns: tuple[Column, ...]) -> str:
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
     unit = SCHEMA.get(KINDS[column.role], "deg")
-    # dB are levels without a reference; calling them dBm would invent one.
-    return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
+    # Levels of which nobody said more are in dB; calling them dBm would invent a reference.
+    return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
 
 
-def as_station(column: Column) -> Column:
+def as_station_column(column: Column) -> Column:
     """Return the same column of a list of stations, where ends need not be named."""
     axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
     return column if axis is None else replace(column, role=f"station_{axis}")

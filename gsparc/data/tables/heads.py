@@ -31,17 +31,17 @@ OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "heigh
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
 
-def by_word(table: str) -> dict[str, str]:
+def meaning_by_word(table: str) -> dict[str, str]:
     """Return which entry of a table of words.yaml each of its words stands for."""
     return {word: meaning for meaning, words in SHEET[table].items() for word in words.split()}
 
 
 SHEET: dict[str, Any] = yaml.safe_load(files(__package__).joinpath("words.yaml").read_text(encoding="utf-8"))
 LISTS = {name: set(words.split()) for name, words in SHEET.items() if isinstance(words, str)}
-STATION_WORDS, END_WORDS = LISTS["station"], by_word("ends")
+STATION_WORDS, END_WORDS = LISTS["station"], meaning_by_word("ends")
 TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
-_AXIS, _PART = by_word("axes"), by_word("part")
-_TOPIC = dict.fromkeys(STATION_WORDS | LISTS["less"], "a station") | by_word("topics")
+_AXIS, _PART = meaning_by_word("axes"), meaning_by_word("part")
+_TOPIC = dict.fromkeys(STATION_WORDS | LISTS["less"], "a station") | meaning_by_word("topics")
 _TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
 
 
@@ -66,14 +66,14 @@ class Head:
     less: bool = False
 
 
-def about(head: str) -> str | None:
+def topic_of(head: str) -> str | None:
     """Tell of which of the topics a head speaks; None: of none."""
     words = words_of(unit_of(head)[0])
     topics = (_TOPIC[word] for word in words if word in _TOPIC)
     return None if LISTS["accuracy"] & set(words) else next(topics, None)
 
 
-def understand(text: str) -> Head:
+def understand_head(text: str) -> Head:
     """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`, `rssi_gateway7` or `csi_re_3`."""
     plain, unit, strange = unit_of(text)
     words = words_of(plain)
@@ -84,13 +84,13 @@ def understand(text: str) -> Head:
         last = UNITS[words[-1]]
         cut = re.sub(rf"[\W_]*{re.escape(words[-1])}\W*$", "", plain, flags=re.IGNORECASE)
         head = _role(words[:-1], last, cut)
-        if head.role and suits(head.role, last):
+        if head.role and unit_suits(head.role, last):
             return head
     head = _role(words, unit, plain)
     return replace(head, unit=unit, strange=strange)
 
 
-def suits(role: str, unit: Unit) -> bool:
+def unit_suits(role: str, unit: Unit) -> bool:
     """Tell whether a column of `role` can be in `unit`."""
     return KINDS[role] == unit.kind or (KINDS[role], unit.kind) == ("phase", "angle")
 

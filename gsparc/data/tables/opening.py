@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import pandas as pd
 from fsspec.core import url_to_fs
 
-from gsparc.data.errors import Caution, DataError, Problems, lines_of, reason
-from gsparc.data.files import Several, checked_line
+from gsparc.data.errors import Caution, DataError, Problems, explain_error, name_row_ranges
+from gsparc.data.files import SeveralFiles, check_line_length
 from gsparc.data.tables import TABLE_SUFFIXES
-from gsparc.data.tables.heads import SHEET, understand
+from gsparc.data.tables.heads import SHEET, understand_head
 from gsparc.data.tables.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def opened(source: str) -> Iterator[Dataset]:
+def open_parquet(source: str) -> Iterator[Dataset]:
     """Open the dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
 
     Raises:
@@ -40,12 +40,12 @@ def opened(source: str) -> Iterator[Dataset]:
         system, at = url_to_fs(source) if "://" in source else (None, source)
         yield dataset.dataset(at, filesystem=system, format="parquet", partitioning="hive")
     except (ArrowException, OSError, ValueError, ImportError) as error:
-        raise DataError(f"{source}: damaged or not a Parquet file ({reason(error)})") from None
+        raise DataError(f"{source}: damaged or not a Parquet file ({explain_error(error)})") from None
 
 
 def read_parquet(source: str, most: int | None = None) -> Sheet:
-    """Read columns of what `opened` opens, of the first `most` rows where said; `DataError` likewise."""
-    with opened(source) as files:
+    """Read columns of what `open_parquet` opens, of the first `most` rows if said; `DataError` likewise."""
+    with open_parquet(source) as files:
         frame = (files.to_table() if most is None else files.head(most)).to_pandas()
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
@@ -151,7 +151,7 @@ def _lines(text: str, source: str) -> tuple[Lines, str]:
     text = QUOTED.sub(_in_one_line, text) if '"' in text else text
     # Not str.splitlines, which also ends lines at characters that may stand in a cell.
     for line in re.split(BREAK, text):
-        stripped = checked_line(source, number, line).strip()
+        stripped = check_line_length(source, number, line).strip()
         if stripped.startswith(COMMENTS) and not lines:
             comment = stripped.lstrip("#%/ ")
         elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
@@ -181,7 +181,7 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
     for delimiter in DELIMITERS:
         cells = [_cells(lines[n], delimiter) for n in numbers]
         usual = Counter(map(len, cells)).most_common(1)[0][0]
-        named = {cell: bool(understand(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
+        named = {cell: bool(understand_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
         above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
@@ -199,7 +199,7 @@ def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
     again = {n for n in below if lines[n].strip("\ufeff \t") == line}
     if not again:
         return lines, []
-    where = lines_of([f"line {n}" for n in sorted(again)])
+    where = name_row_ranges([f"line {n}" for n in sorted(again)])
     what = Caution(f"{where}: the heads again; left out: are these files joined that belong together?")
     return {n: text for n, text in lines.items() if n not in again}, [what]
 
@@ -219,7 +219,7 @@ def _delimiter(lines: list[str], comment: str) -> str | None:
     def suits(delimiter: str) -> tuple[bool, bool, bool, float, int]:
         count = len(_cells(sample[0], delimiter))
         named = _cells(comment, delimiter) if comment else []
-        heads = len(named) == count and any(understand(cell).role for cell in named)
+        heads = len(named) == count and any(understand_head(cell).role for cell in named)
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
         return count > 1, heads, delimiter != " ", agree, count  # spaces may stand in cells
 
@@ -231,7 +231,7 @@ def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Line
     """The lines, the first of them heads; a comment before values is taken for them where it fits."""
     first = _cells(lines[min(lines)], delimiter)
     heads = _cells(comment, delimiter) if comment else []
-    named = [sum(understand(cell).role is not None for cell in cells) for cells in (heads, first)]
+    named = [sum(understand_head(cell).role is not None for cell in cells) for cells in (heads, first)]
     fits = len(heads) == len(first) and not all(map(_is_number, heads))
     values = all(map(_is_number, first))
     if not values and not (fits and named[0] > named[1]):
@@ -320,7 +320,7 @@ def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[
     return ",", [f"decimal commas: {hint}"]
 
 
-def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
+def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
     """Read the cells of a table, with notes on what was recognised.
 
     Args:
@@ -330,8 +330,8 @@ def sheet_of(path: str | Path, problems: Problems | None = None) -> tuple[Sheet,
     Raises:
         DataError: no such file, another ending, or no table.
     """
-    if isinstance(path, Several):
-        return _stacked([sheet_of(one, problems) for one in path.paths], path)
+    if isinstance(path, SeveralFiles):
+        return _stacked([read_sheet(one, problems) for one in path.paths], path)
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsparc.data.errors import Caution, some
+from gsparc.data.errors import Caution, list_first
 from gsparc.data.links.stations import PER_STATION, SECTOR
-from gsparc.data.tables.columns import Chosen, as_station, choose
-from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand, words_of
-from gsparc.data.tables.sectors import TILTS, meaning, read_sectors, sites_of
+from gsparc.data.tables.columns import Chosen, as_station_column, choose_columns
+from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand_head, words_of
+from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
@@ -42,7 +42,7 @@ class Places:
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
-def places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
+def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
     """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
 
     Where places may be `unknown`, rows without any coordinate are NaN.
@@ -110,7 +110,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
     return None
 
 
-def one_each(
+def place_per_station(
     sheet: Sheet, row_places: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
 ) -> Places | None:
     """Return the place of each station, the same in all its rows; None, and noted, when it is not.
@@ -152,6 +152,7 @@ class StationList:
         index: (S,) which station each row of another table is of; None where each has a column there.
         aliases: other names of all of them.
         repeated: names that several of them share, by the head of their column.
+        label: (T,) its own names, where `names` are others.
     """
 
     names: tuple[str, ...]
@@ -160,6 +161,7 @@ class StationList:
     index: np.ndarray | None = None
     aliases: tuple[tuple[str, ...], ...] = ()
     repeated: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    label: tuple[str, ...] | None = None
 
     def shared(self, words: np.ndarray) -> str | None:
         """Return what is wrong where words (S,) are of a column whose names several stations share."""
@@ -169,7 +171,7 @@ class StationList:
             if twice and len(known & set(names)) > len(known & set(self.names)):
                 which = [own for own, name in zip(self.names, names, strict=True) if name == twice[0]]
                 advice = "leave only those of the area in the list, or say dataset.columns.station=HEAD+HEAD"
-                return f"{head} {twice[0]} names {some(which)} of the list of stations; {advice}"
+                return f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
         return None
 
     def called(self, words: np.ndarray) -> StationList:
@@ -177,7 +179,7 @@ class StationList:
         known = set(words.tolist())
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
-        return replace(self, names=names)
+        return replace(self, names=names, label=None if names == self.names else self.names)
 
     def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
         """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
@@ -196,30 +198,35 @@ class StationList:
             for name, array in self.extra.items()
         }
         where = Places(across, height, self.places.degrees)
-        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra)
-        return grown, lost, [Caution(f"{said}: {some(lost)}; their places are unknown")]
+        label = None if self.label is None else (*self.label, *lost)
+        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra, label=label)
+        return grown, lost, [Caution(f"{said}: {list_first(lost)}; their places are unknown")]
 
 
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
-    naming = [head for head in sheet.heads if understand(head).role == "station"]
+    naming = [head for head in sheet.heads if understand_head(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam is no measurement, whatever its head says besides.
-    others = sheet.frame[[head for head in sheet.heads if meaning(head) not in (*SECTOR, *TILTS)]]
-    chosen, notes = choose(replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {})
-    chosen = {columns[0].role: columns for columns in (tuple(map(as_station, c)) for c in chosen.values())}
-    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if meaning(head))]
+    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in (*SECTOR, *TILTS)]]
+    chosen, notes = choose_columns(
+        replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {}
+    )
+    chosen = {
+        columns[0].role: columns for columns in (tuple(map(as_station_column, c)) for c in chosen.values())
+    }
+    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if sector_quantity(head))]
     notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station"), notes
-    coordinates = places(sheet, chosen, "station_", unknown=True)
+    coordinates = read_places(sheet, chosen, "station_", unknown=True)
     used = {column.head for columns in chosen.values() for column in columns}
     aliases = _aliases(sheet, used)
     sectors, more = read_sectors(sheet, {head for head in used if head} | {pair[0] for pair in aliases})
     notes += more
-    sites = sites_of(sheet)
+    sites = number_sites(sheet)
     if sites is not None:
         sectors["station_site"] = sites
     if coordinates is not None and coordinates.height is None and "height" in sectors:

@@ -11,20 +11,36 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.checks.outliers import two_groups
-from gsparc.data.errors import Caution, nearest, some
-from gsparc.data.files import Several
+from gsparc.data.checks.outliers import find_gap
+from gsparc.data.errors import Caution, list_first, suggest_nearest
+from gsparc.data.files import SeveralFiles
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Noted, Raw
 from gsparc.data.schema import ENDS, OTHER
-from gsparc.data.tables.cells import LOOKED_AT, merged
-from gsparc.data.tables.columns import CHANNELS, JOINED, LEVELS, POLAR, Chosen, Column, choose, schema_unit
+from gsparc.data.tables.cells import LOOKED_AT, merge_cells
+from gsparc.data.tables.columns import (
+    CHANNELS,
+    JOINED,
+    LEVELS,
+    POLAR,
+    Chosen,
+    Column,
+    choose_columns,
+    schema_unit,
+)
 from gsparc.data.tables.heads import LISTS, PERCENT, words_of
-from gsparc.data.tables.opening import read_parquet, sheet_of
-from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, StationList, one_each, places, read_stations
+from gsparc.data.tables.opening import read_parquet, read_sheet
+from gsparc.data.tables.places import (
+    UNKNOWN_HEIGHT,
+    Places,
+    StationList,
+    place_per_station,
+    read_places,
+    read_stations,
+)
 from gsparc.data.tables.sheet import Sheet
-from gsparc.data.tables.slots import unfolded
+from gsparc.data.tables.slots import unfold_slots
 
 NOTHING: Mapping[str, object] = {}
 
@@ -48,27 +64,27 @@ def understand_table(
         DataError: all problems, with row and column.
     """
     # Of Parquet with cells only the first rows are read here: `merged` streams the file in chunks.
-    sheet, notes = sheet_of(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
-    sheet, unfolding = unfolded(sheet, {str(value) for value in columns.values()})
+    sheet, notes = read_sheet(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
+    sheet, unfolding = unfold_slots(sheet, {str(value) for value in columns.values()})
     notes = [*notes, *unfolding]
     listed = None
     if stations_file is not None:
-        second, _ = sheet_of(stations_file, sheet.problems)
+        second, _ = read_sheet(stations_file, sheet.problems)
         listed, list_notes = read_stations(second)
         notes += list_notes
         sheet.problems.raise_if_any()
     # The list of stations comes before the columns: heads that equal its names are levels of stations.
-    chosen, guessed = choose(sheet, columns, () if listed is None else listed.names)
+    chosen, guessed = choose_columns(sheet, columns, () if listed is None else listed.names)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
     if cell_m is not None:
         chosen.pop("row_name", None)  # rows of a cell have many
-        sheet = merged(sheet, chosen, cell_m)
+        sheet = merge_cells(sheet, chosen, cell_m)
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
-    about = {"name": "+".join(Path(one).stem for one in path.paths)} if isinstance(path, Several) else {}
+    about = {"name": "+".join(Path(one).stem for one in path.paths)} if isinstance(path, SeveralFiles) else {}
     if power is not None and power.unit is not None:
         about |= {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
         if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
@@ -185,7 +201,7 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        by_end = {end: places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
+        by_end = {end: read_places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
         ends = {end: where for end, where in by_end.items() if where is not None}
         if self.sheet.problems:
             return
@@ -205,6 +221,7 @@ class Builder:
         others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
             self.arrays["station_name"] = np.array(stations.names)
+            self.arrays |= {} if stations.label is None else {"station_label": np.array(stations.label)}
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
             others["station"] = stations.places
         self._add_places(moving, where)
@@ -220,7 +237,7 @@ class Builder:
 
     def _zones(self, where: Places) -> str:
         """Head of a column that tells two groups of places far apart from each other; empty without."""
-        groups = None if where.degrees else two_groups(where.across)
+        groups = None if where.degrees else find_gap(where.across)
         if groups is None:
             return ""
         used = {column.head for columns in self.chosen.values() for column in columns}
@@ -255,7 +272,7 @@ class Builder:
 
     def _stations(self, measured: str | None, end_places: dict[str, Places]) -> StationList | None:
         """The stations, where there are; an end that is their place is taken out of `end_places`."""
-        where = places(self.sheet, self.chosen, "station_")
+        where = read_places(self.sheet, self.chosen, "station_")
         labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
             self.refuse(f"two columns of the station {label!r}; rename one")
@@ -287,19 +304,19 @@ class Builder:
         index, distinct = pd.factorize(words)  # in the order of their first rows
         names = tuple(map(str, distinct))
         if where is not None:
-            each = one_each(self.sheet, where, index, names)
+            each = place_per_station(self.sheet, where, index, names)
             return None if each is None else StationList(names, each, index=index)
         if self.sheet.problems:
             return None
         ends = [end for end in ("tx_", "rx_") if end in end_places] if len(end_places) > 1 else []
         for end in ends:
             # A place that differs among a station's rows is no error yet: the other end may be the station's.
-            each = one_each(self.sheet, end_places[end], index, names, ask=True)
+            each = place_per_station(self.sheet, end_places[end], index, names, ask=True)
             if each is not None:
                 end_places.pop(end)
                 return StationList(names, each, index=index)
         if ends:
-            one_each(self.sheet, end_places[ends[0]], index, names)
+            place_per_station(self.sheet, end_places[ends[0]], index, names)
             return None
         if measured in LEVELS:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
@@ -348,7 +365,7 @@ class Builder:
         for word in [word for word in dict.fromkeys(words.tolist()) if word not in known]:
             row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
             place = "the heads" if head is None else f"column {head!r}, {row}"
-            fault = f"{word!r} is no listed station{nearest(word, self.listed.names)}"
+            fault = f"{word!r} is no listed station{suggest_nearest(word, self.listed.names)}"
             self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
@@ -361,7 +378,7 @@ class Builder:
 
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
-            self.notes.append(f"listed, but {where}: {some(names, 8)}")
+            self.notes.append(f"listed, but {where}: {list_first(names, 8)}")
 
     def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
         """Of two ends in degrees, the one with fewer places, which are then stations."""

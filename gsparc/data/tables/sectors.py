@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, some
-from gsparc.data.files import shipped
+from gsparc.data.errors import Caution, list_first
+from gsparc.data.files import read_shipped_table
 from gsparc.data.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 
 HEADS = {text: name for name, texts in SHEET["sectors"].items() for text in texts}
 # 3GPP TS 36.101, table 5.7.3-1: lowest downlink frequency [MHz] of a band, and its first EARFCN.
-BANDS = pd.DataFrame(shipped(__package__, "bands.csv")).astype(float).set_index("band")
+BANDS = pd.DataFrame(read_shipped_table(__package__, "bands.csv")).astype(float).set_index("band")
 TILTS = ("total", "mechanical", "electrical")
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
 MHZ = 1e6
 
 
-def meaning(head: str) -> str | None:
+def sector_quantity(head: str) -> str | None:
     """Return what a head of a list says of a sector; None: nothing."""
     words = " ".join(word for word in words_of(unit_of(head)[0]) if word not in LISTS["sector_beside"])
     return HEADS.get(words)
@@ -47,7 +47,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     found: dict[str, np.ndarray] = {}
     notes, unread, heads = [], [], []
     for head in [head for head in sheet.heads if head not in used]:
-        name, unit = meaning(head), unit_of(head)[1]
+        name, unit = sector_quantity(head), unit_of(head)[1]
         words = sheet.words(head) if name else np.zeros(0, str)
         values = pd.to_numeric(pd.Series([_number(word) for word in words]), errors="coerce").to_numpy(float)
         if name is None or name in found or not np.isfinite(values).any():
@@ -74,12 +74,12 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     if heads:
         notes.append(f"{sheet.source}: of sectors {', '.join(heads)}")
     if unread:
-        heads_ = f"column{'s' * (len(unread) > 1)} {some(unread, 8)}"
+        heads_ = f"column{'s' * (len(unread) > 1)} {list_first(unread, 8)}"
         notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
     return found, notes
 
 
-def sites_of(sheet: Sheet) -> np.ndarray | None:
+def number_sites(sheet: Sheet) -> np.ndarray | None:
     """Number (T,) float64 the sites that a column of the list names; None where none does."""
     for head in sheet.heads:
         words = sheet.words(head) if " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import pandas as pd
 
-from gsparc.data.errors import some
-from gsparc.data.tables.heads import by_word, unit_of, words_of
+from gsparc.data.errors import list_first
+from gsparc.data.tables.heads import meaning_by_word, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 
-HOLDS = by_word("slots")
+HOLDS = meaning_by_word("slots")
 NEEDED, LEAST = {"PCI", "RSRP"}, 2  # of a slot; slots
 
 
-def slots_of(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
+def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     """Return heads of each slot by what they hold, by the slot's name; empty where there are not several."""
     found: dict[str, dict[str, str]] = {}
     for head in heads:
@@ -28,14 +28,14 @@ def slots_of(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     return slots if len(slots) >= LEAST else {}
 
 
-def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
+def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     """Return a row per slot with a cell and its level, rows of one moment together, and a note.
 
     Args:
         sheet: the table.
         said: heads that settings name: their table is taken as it is.
     """
-    slots = slots_of(sheet.heads)
+    slots = find_slots(sheet.heads)
     used = [head for parts in slots.values() for head in parts.values()]
     if not slots or any(head in said for head in used):
         return sheet, []
@@ -51,4 +51,4 @@ def unfolded(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     whole = pd.concat(parts).sort_index(kind="stable")
     rows = tuple(sheet.rows[i] for i in whole.index)
     result = replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
-    return result, [f"slots {some([*map(repr, slots)], 3)}: {len(rows)} rows of {len(sheet)} moments"]
+    return result, [f"slots {list_first([*map(repr, slots)], 3)}: {len(rows)} rows of {len(sheet)} moments"]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from gsparc.data.instantiate import find, plugins
+from gsparc.data.instantiate import import_target, plugins
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models.registry import methods
 
@@ -72,7 +72,7 @@ def plugged() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
     found = {}
     for name, path in plugins("model").items():
-        kind = find(path)
+        kind = import_target(path)
         if name not in methods() and kind is not None:  # one that cannot be imported is warned of
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
             found[name] = Contender(name, (), budget, tuple(getattr(kind, "kinds", ())))

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.assemble import content_hash, identity
+from gsparc.data.assemble import content_hash, identity_hash
 from gsparc.data.errors import DataError
 from gsparc.data.files import SUMMARY, set_aside, whole_file
-from gsparc.data.instantiate import targets
+from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import git, read_summary
 from gsparc.models.fitting import LAST, leaves
@@ -91,7 +91,7 @@ def content(data: Measurements) -> str:
     """Return the SHA-256 of all that a method can learn from, of every file that was read."""
     arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
     arrays |= {f"release {i}": rows for i, rows in enumerate(data.release_split or ())}
-    whole = (identity(data), content_hash(arrays), data.provenance.get("scene"))
+    whole = (identity_hash(data), content_hash(arrays), data.provenance.get("scene"))
     return sha256(repr(whole).encode()).hexdigest()
 
 
@@ -156,7 +156,7 @@ def once(
 
 def program(settings: Any) -> str:
     """Return the hash of the text of gsparc and of every other package that settings name classes of."""
-    named = {str(path).partition(".")[0] for path in targets(settings)}
+    named = {str(path).partition(".")[0] for path in iterate_targets(settings)}
     return _program(tuple(sorted({"gsparc", *named} - LIBRARIES)))
 
 

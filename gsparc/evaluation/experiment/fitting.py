@@ -13,8 +13,8 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.data.executor import each
-from gsparc.data.files import no_room
+from gsparc.data.executor import run_each
+from gsparc.data.files import is_out_of_space
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, finished, once
@@ -112,7 +112,7 @@ def _tried(run: Run, one: Prepared) -> Filled | str:
     try:
         return one.filled(once(one.folder, one.state, partial(run, one), reuse=one.reuse))
     except Exception as error:  # any error of a plugin
-        if no_room(error):  # the others would be trained in vain
+        if is_out_of_space(error):  # the others would be trained in vain
             raise
         unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
         return one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
@@ -147,7 +147,7 @@ def fill_all(
     here = missing if train else []
     work = partial(_tried, run)
     try:
-        for number, result in each(work, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
+        for number, result in run_each(work, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
             if isinstance(result, str):
                 log.warning("%s failed: %s", here[number].cell, result)
                 continue

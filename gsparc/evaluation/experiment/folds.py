@@ -13,7 +13,7 @@ from hydra.utils import instantiate
 from lightning import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.executor import each, elsewhere
+from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
@@ -119,7 +119,7 @@ def fit_folds(
         RuntimeError: training diverged.
     """
     # Pickled for other processes, they would write into this run's files from several at once.
-    if elsewhere() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
+    if uses_other_processes() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
     def fitted(number: int) -> tuple[Method, FitReport, float]:
@@ -133,7 +133,7 @@ def fit_folds(
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}
     # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
-    for number, one in each(fitted, range(len(split.folds)), "folds"):
+    for number, one in run_each(fitted, range(len(split.folds)), "folds"):
         by_fold[number] = one
         if keep is not None:
             keep(number, *one[:2])

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.heeded import Option, Reads
-from gsparc.data.instantiate import find
+from gsparc.data.instantiate import import_target
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.models.fitting import leaves
@@ -64,7 +64,7 @@ def _holders(path: str, node: DictConfig, method: MethodFactory) -> Iterator[tup
     """Classes and attributes that hold a setting, none where this is not known."""
     group, _, name = path.rpartition(".")
     stored = method.stored_names.get(path.removeprefix("model."))
-    kind: Any = find(str(node.get("_target_")))
+    kind: Any = import_target(str(node.get("_target_")))
     if group == "split":
         kind = FileSettings if node.name == "file" else SplitSettings
     as_named = group == "model" and stored is None and vars(method).get(name, ...) == node[name]

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.instantiate import from_settings
 from gsparc.data.load import load, split_for
-from gsparc.data.public.fetch import found
+from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
@@ -164,7 +164,9 @@ def problems_of(settings: Mapping[str, Any]) -> list[Problem]:
     problems, absent = list[Problem](), list[str]()
     for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
         paths = [
-            path or found(own.get("dataset", name)) for key, path in own.items() if key in ("root", "file")
+            path or fetched_path_or_none(own.get("dataset", name))
+            for key, path in own.items()
+            if key in ("root", "file")
         ]
         if own and not any(paths):  # a plugin's dataset may need no path
             absent.append(name)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 
-from gsparc.data.executor import each
+from gsparc.data.executor import run_each
 from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
@@ -151,7 +151,7 @@ class Study:
         """
         cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
         work = partial(self._tried, data=data, split=split, context=context, state=state)
-        found = dict(each(work, cells, "rounds of variants"))
+        found = dict(run_each(work, cells, "rounds of variants"))
         rows = list[dict[str, Any]]()
         for number, (variant, turn) in enumerate(cells):
             facts, folder = found[number], context.run_dir / variant / str(turn)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import identity
+from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets
@@ -40,7 +40,7 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
         rows: (n,) sorted.
         seed: of the random starts.
     """
-    known, names = _kept(f"{identity(data)} {seed}"), [one.name for one in fields(RecoveredVectors)]
+    known, names = _kept(f"{identity_hash(data)} {seed}"), [one.name for one in fields(RecoveredVectors)]
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))

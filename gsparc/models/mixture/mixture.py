@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.inner_folds import cut_inside
+from gsparc.data.inner_folds import cut_inner_folds
 from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -166,7 +166,11 @@ class Mixture(LearnsTogether, ClosedForm):
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
-        cut = cut_inside(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
+        cut = (
+            cut_inner_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed)
+            if several
+            else None
+        )
         found, reports, read = fit_candidates.fit_all(
             parts, init, self.switches, data, fold, context, budget, cut
         )

@@ -24,7 +24,7 @@ from gsparc.simulate.calibration import (
     Calibration,
     Material,
     Replay,
-    apply,
+    apply_materials,
     calibrate,
     used_materials,
 )
@@ -109,7 +109,7 @@ class CalibratedRayTracer(Method):
         own = used_materials(tracer)
         start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
         # Before the replay, whose first powers are those under the start's materials.
-        apply(tracer, start)
+        apply_materials(tracer, start)
         # Paths are traced once: materials change what they carry, not where they run.
         replay = Replay(tracer, places, self._traced_effects())
         traced = replay.powers()
@@ -184,7 +184,7 @@ class CalibratedRayTracer(Method):
             place = self.site.static_position + self.site.origin
             self._tracer = load_tracer(scene, Sampling(self.samples, self.batch), place, self.site.name)
             if self.learned is not None:
-                apply(self._tracer, self.learned.materials)
+                apply_materials(self._tracer, self.learned.materials)
         return self._tracer
 
     def state(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.inner_folds import cut_inside
+from gsparc.data.inner_folds import cut_inner_folds
 from gsparc.data.limits import check_arguments, or_word, switch, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -488,7 +488,7 @@ def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     known = np.sort(np.concatenate([fold.train, fold.val]))
     if len(known) < 3 * LEAST_HELD:
         return fold
-    cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
+    cut = cut_inner_folds(data, fold, context.split, 3, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import finite
+from gsparc.data.limits import finite_array
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.receivers import Ground, clear_of, layout, receivers
-from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, stations
+from gsparc.simulate.scenes.receivers import Ground, layout_from_config, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Engine, Survey
 
@@ -92,11 +92,11 @@ class SceneSettings:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
         if self.transmitters is not None and not self.transmitters:
             raise ValueError("scene.transmitters: an empty list; expected a transmitter or more")
-        if self.transmitter_m is not None and finite(self.transmitter_m).shape != (3,):
+        if self.transmitter_m is not None and finite_array(self.transmitter_m).shape != (3,):
             raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
         if self.over not in OVER:
             raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
-        if layout(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
+        if layout_from_config(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
         if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):
             raise ValueError("scene: carrier_hz is positive, bandwidth_hz at least 0, subcarriers at least 1")
@@ -120,7 +120,7 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
     return from_settings(SceneSettings, config, "scene")
 
 
-def build(scene: SceneSettings, sampling: Sampling) -> Survey:
+def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     """Build the scene with its transmitters and receivers.
 
     Raises:
@@ -137,9 +137,9 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
     georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
     # Heights of masts count from the highest surface, a roof where there is one.
     masts = _stated(scene, tracer.height, georeference) or [_in_the_middle(tracer, ground, area)]
-    placed = receivers(
-        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, ground, streets,
-        georeference,
+    placed = place_receivers(
+        layout_from_config(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed,
+        ground, streets, georeference,
     )  # fmt: skip
     # Copies that share the scene, which is loaded once.
     engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
@@ -190,7 +190,7 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
     Of several there, sectors of a mast, it is the one that `name` ends with; without one an isotropic one.
 
     Raises:
-        ValueError, SimulatorMissing: see `build`.
+        ValueError, SimulatorMissing: see `build_survey`.
     """
     tracer, town, _ = _load(scene, sampling)
     masts = _stated(scene, tracer.height, None if town is None else town.georeference) or []
@@ -211,8 +211,13 @@ def _shoebox(scene: SceneSettings) -> Survey:
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
     engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
-    placed = receivers(
-        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, Ground(room.contains)
+    placed = place_receivers(
+        layout_from_config(scene.receivers),
+        scene.num_receivers,
+        area,
+        scene.height_m,
+        scene.seed,
+        Ground(room.contains),
     )
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
@@ -231,7 +236,7 @@ def _load(
             raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
-        allowed = clear_of(source)
+        allowed = stands_clear_of(source)
     # At the origin for the time being: `at` puts a copy at each transmitter.
     return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
 
@@ -250,7 +255,7 @@ def _stated(
     scene: SceneSettings, surface: Any, georeference: Georeference | None
 ) -> list[Transmitter] | None:
     if scene.transmitters is not None:
-        return stations(scene.transmitters, surface, georeference)
+        return place_transmitters(scene.transmitters, surface, georeference)
     if scene.transmitter_m is not None:
         return [Transmitter("tx", np.array(scene.transmitter_m, dtype=np.float64))]
     return None

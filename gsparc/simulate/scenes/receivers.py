@@ -78,7 +78,7 @@ class Placed(NamedTuple):
     time_s: np.ndarray | None = None
 
 
-def layout(config: Mapping[str, Any] | None) -> Layout:
+def layout_from_config(config: Mapping[str, Any] | None) -> Layout:
     """Return settings from `scene.receivers`.
 
     Raises:
@@ -87,7 +87,7 @@ def layout(config: Mapping[str, Any] | None) -> Layout:
     return from_settings(Layout, config or {}, "scene.receivers")
 
 
-def receivers(
+def place_receivers(
     how: Layout,
     count: int,
     area: np.ndarray,
@@ -115,7 +115,7 @@ def receivers(
             return ground.allowed(ground.lift(points))
 
         # Drawn with heights above the ground, tested and returned in the world.
-        return Placed(ground.lift(place(count, area, height, allowed, seed)))
+        return Placed(ground.lift(draw_places(count, area, height, allowed, seed)))
     if how.kind == "file":
         flat, time_s = _of_file(how, georeference, float(np.mean(height)))
         names = [f"row {i}" for i in range(len(flat))]
@@ -213,10 +213,6 @@ def _of_file(
             raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
         across = georeference.from_degrees(*across.T)
     above = np.full(len(across), height) if listed.height is None else listed.height
-    if time_s is not None and len(time_s) != len(across):
-        raise ValueError(
-            f"scene.receivers.file: {how.file}, time_s: {len(time_s)} times for {len(across)} places"
-        )
     return np.column_stack([across, above]), time_s
 
 
@@ -224,7 +220,7 @@ TRIES = 200  # draws for each place, of which one is to be allowed
 DRAWN = 1024  # at a time
 
 
-def place(
+def draw_places(
     count: int,
     area: np.ndarray,
     height: Sequence[float],
@@ -236,7 +232,7 @@ def place(
     A larger count begins with the positions of a smaller one.
 
     >>> area = np.array([[0.0, 0.0], [9.0, 9.0]])
-    >>> place(5, area, (1.2, 1.8), lambda points: points[:, 0] > 3, seed=0).shape
+    >>> draw_places(5, area, (1.2, 1.8), lambda points: points[:, 0] > 3, seed=0).shape
     (5, 3)
 
     Args:
@@ -262,7 +258,7 @@ def place(
     raise ValueError(f"scene: {fit}; is that area inside a building?")
 
 
-def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
+def stands_clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
     """Return a test: which places (n, 3) [m] stand `margin` [m] away from boxes and off sheets."""
     boxes = np.array([s.keep_out for s in solids if s.keep_out is not None]).reshape(-1, 2, 3)
     walls = [s.vertices for s in solids if s.keep_out is None]
@@ -284,10 +280,10 @@ def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndar
     return allowed
 
 
-def spread(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
+def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Choose rows (count,) of positions far apart: farthest-point order from a seeded start.
 
-    >>> spread(np.array([[0.0], [0.1], [9.0], [9.1]]), count=2, seed=0).shape
+    >>> farthest_points(np.array([[0.0], [0.1], [9.0], [9.1]]), count=2, seed=0).shape
     (2,)
     """
     count = min(count, len(positions))
@@ -301,10 +297,10 @@ def spread(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def neighbours(positions: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def nearest_rows(positions: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the nearest other row of each of `rows`.
 
-    >>> neighbours(np.array([[0.0], [1.0], [9.0]]), rows=np.array([2]))
+    >>> nearest_rows(np.array([[0.0], [1.0], [9.0]]), rows=np.array([2]))
     array([1])
     """
     nearest = cKDTree(positions).query(positions[rows], k=2)[1]

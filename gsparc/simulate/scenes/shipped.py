@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 
-def shipped() -> list[str]:
+def list_shipped_scenes() -> list[str]:
     """Return names, sorted; none where Sionna is not installed."""
     spec = importlib.util.find_spec("sionna")
     folders = () if spec is None else tuple(spec.submodule_search_locations or ())
@@ -15,7 +15,7 @@ def shipped() -> list[str]:
     return sorted(path.stem for path in files if path.stem == path.parent.name)
 
 
-def settings(name: str) -> dict[str, Any]:
+def shipped_scene_settings(name: str) -> dict[str, Any]:
     """Return what `scene=NAME` means for a shipped scene that has no file in `conf/scene`."""
     return {
         "name": name, "builtin": name, "transmitter_m": None, "transmitters": None, "area_m": None,

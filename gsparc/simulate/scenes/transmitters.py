@@ -71,7 +71,7 @@ class Mast:
     sectors: int = 1
 
 
-def stations(
+def place_transmitters(
     entries: Sequence[Mapping[str, Any]],
     surface: Callable[[np.ndarray], np.ndarray] | None,
     georeference: Georeference | None,

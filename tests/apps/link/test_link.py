@@ -262,8 +262,8 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
 
 
 def _split():
-    from gsparc.data.splits import Split, indices_hash
+    from gsparc.data.splits import Split, hash_indices
 
     one = fold()
     whole = type(one)(one.train[:40], one.val, np.concatenate([np.arange(40, 80), one.test]))
-    return Split("toy", (whole,), indices_hash((whole,)))
+    return Split("toy", (whole,), hash_indices((whole,)))

@@ -8,7 +8,7 @@ from releases import real
 from gsparc.apps.locate.fingerprints import fingerprint_snapshots
 from gsparc.apps.locate.neighbours import PLAIN, feature_vectors, locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
-from gsparc.data.datasets.fingerprints import parted, read_fingerprints
+from gsparc.data.datasets.fingerprints import read_fingerprints, split_fingerprints
 
 
 def hall(count, seed):
@@ -53,7 +53,7 @@ def test_a_phase_of_a_whole_channel_is_no_feature():
 def test_weighted_neighbours_do_as_published_on_a_floor():
     """1.5 m is known of five neighbours."""
     rows = read_fingerprints(real("locate/wifine-floor4.npz"))
-    train, test = parted(rows, "walks", share=0.25)
+    train, test = split_fingerprints(rows, "walks", share=0.25)
     known, heard = (fingerprint_snapshots(rows.at(part)) for part in (train, test))
     place, *_ = locate_by_neighbours("weighted_knn", known, heard)
     assert 0.9 < np.median(np.linalg.norm(place - rows.position[test], axis=1)) < 1.6

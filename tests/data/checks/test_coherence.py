@@ -7,7 +7,7 @@ import numpy as np
 import packets
 import pytest
 
-from gsparc.data.checks.coherence import allowed, coherence
+from gsparc.data.checks.coherence import estimate_coherence, set_freedom
 from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
@@ -22,17 +22,17 @@ def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled)
     for transmitter in range(3):
         given, channel = packets.robot(transmitter, 10 * transmitter, layout)
         tones = given["frequency_hz"] - given["frequency_hz"].mean()
-        coherent = coherence(packets.measurements(given, channel))
+        coherent = estimate_coherence(packets.measurements(given, channel))
         assert coherent is not None and coherent.freedom == "none"
         if not labelled:
             del given["run"]
         logged = packets.measurements(given, packets.logged(channel, tones, 0))
-        assert coherence(logged).freedom == "phase+delay"
+        assert estimate_coherence(logged).freedom == "phase+delay"
         turned = packets.logged(channel, 0 * tones, 0)
-        assert coherence(packets.measurements(given, turned)).freedom.startswith("phase")
+        assert estimate_coherence(packets.measurements(given, turned)).freedom.startswith("phase")
         if not labelled:  # millimetres apart
             louder = packets.measurements(given, packets.logged(channel, tones, 0, 6.0))
-            assert coherence(louder).freedom == "phase+delay+gain"
+            assert estimate_coherence(louder).freedom == "phase+delay+gain"
 
 
 def waves(seed, noise=0.0, spacing=0.03):
@@ -54,20 +54,20 @@ def waves(seed, noise=0.0, spacing=0.03):
 def test_no_false_alarm_on_coherent_waves(spacing):
     for seed in range(5):
         for noise in (0.0, 0.5, 3.0):
-            found = coherence(waves(seed, noise, spacing))
+            found = estimate_coherence(waves(seed, noise, spacing))
             assert found is None or found.freedom == "none", (seed, noise, str(found))
 
 
 def test_the_setting_wins_over_the_verdict(caplog):
     data = waves(0)
-    assert allowed(data, "auto") is data
-    assert allowed(data, "phase").site.freedom == "phase"
+    assert set_freedom(data, "auto") is data
+    assert set_freedom(data, "phase").site.freedom == "phase"
     draw = np.random.default_rng(0)
     turn = np.exp(2j * np.pi * draw.uniform(size=len(data)))
     own = replace(data, target=(data.target * turn[:, None, None]).astype(np.complex64))
     with caplog.at_level(logging.WARNING):
-        assert allowed(own, "auto").site.freedom == "phase"
+        assert set_freedom(own, "auto").site.freedom == "phase"
     assert "every row has a phase of its own" in caplog.text and "dataset.align=none" in caplog.text
-    assert allowed(own, "none").site.freedom == "none"
+    assert set_freedom(own, "none").site.freedom == "none"
     with pytest.raises(SettingError, match=r"dataset\.align=level"):
-        allowed(data, "level")
+        set_freedom(data, "level")

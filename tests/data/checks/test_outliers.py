@@ -6,7 +6,7 @@ from campaigns import channels, powers, spectra
 from releases import real
 
 from gsparc.commands.check import main as check
-from gsparc.data.checks.outliers import outliers, too_far, too_strong
+from gsparc.data.checks.outliers import find_outliers, too_far, too_strong
 from gsparc.data.load import load, split_for
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
@@ -60,7 +60,7 @@ def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
 @pytest.mark.parametrize("split", ["random", "grouped", "corner", "sparse"])
 def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
     clean, wrong = spoilt("csi", tmp_path, 5, 1e8)
-    assert outliers(wrong) and not outliers(clean)
+    assert find_outliers(wrong) and not find_outliers(clean)
     kept = split_for({"name": split, "leave_out": "outliers"}, wrong)
     for fold in kept.folds:
         assert 5 not in np.concatenate([fold.train, fold.val, fold.test])

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.checks import plausibility
 from gsparc.data.checks.describe import suspicious_values
-from gsparc.data.checks.level_steps import level_steps
+from gsparc.data.checks.level_steps import detect_level_steps
 from gsparc.data.checks.plausibility import LinkLevels, link_levels
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
@@ -38,7 +38,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
 
 def warnings_of(levels: LinkLevels | None):
     assert levels is not None
-    return plausibility.plausibility_warnings(levels, plausibility.steps_of(levels))
+    return plausibility.plausibility_warnings(levels, plausibility.find_level_steps(levels))
 
 
 def room(seed=0, count=100):
@@ -91,9 +91,9 @@ def test_sound_degrees():
 
 
 @pytest.mark.parametrize("level, said", [
-    (lambda v: 10 ** (v / 10), "linear power? then give it as rssi"),
-    (lambda v: -v + 40, "all positive: losses, percent, or linear?"),
-    (lambda v: np.round((v + 100) / 2), "whole numbers from"),
+    (lambda v: 10 ** (v / 10), "or linear (then give it as rssi"),
+    (lambda v: -v + 40, "is below 0: losses, per cent"),
+    (lambda v: np.round((v + 100) / 2), "an index, or linear"),
     (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
     (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
     (lambda v: v * 0 - 3, "all levels are -3 dB"),
@@ -108,16 +108,6 @@ def test_whole_decibels_are_sound():
     assert plausibility.level_warnings(np.array([np.nan, np.nan])) == []
 
 
-def test_losses_rise_with_distance():
-    place, level = room()
-    where = np.array([[3, 2, 2.5]])
-    assert plausibility.direction_warnings(as_links(place, level[:, None], ["a"], where)) == []
-    assert (
-        "rise with distance"
-        in plausibility.direction_warnings(as_links(place, -level[:, None], ["a"], where))[0]
-    )
-
-
 def test_copies_and_repeated_measurements():
     place, level = room(count=20)
     place[5], level[5] = place[3], level[3]  # a copy
@@ -125,16 +115,16 @@ def test_copies_and_repeated_measurements():
     place[11] = place[10]  # of another station
     level[11] = level[10]
     links = replace(as_links(place, level[:, None], ["a"]), station=np.arange(20) // 11 % 2)
-    found = plausibility.copies(links)
+    found = plausibility.duplicate_warnings(links)
     assert len(found) == 2 and "row 5 of row 3; leave" in found[0]
     assert "1 places were measured more than once" in found[1] and "1.4 dB" in found[1]
 
 
 def test_a_wild_row_is_named():
     place, level, _ = walk(0)
-    assert plausibility.wild_rows(as_links(place, level[:, None], ["a"])) == []
+    assert plausibility.outlier_row_warnings(as_links(place, level[:, None], ["a"])) == []
     level[123] += 60
-    found = plausibility.wild_rows(as_links(place, level[:, None], ["a"]))
+    found = plausibility.outlier_row_warnings(as_links(place, level[:, None], ["a"]))
     assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
 
 
@@ -144,25 +134,25 @@ def test_two_steps_are_found():
     rng = np.random.default_rng(0)
     thrice = np.concatenate([level + rng.normal(0, 2, 400) for _ in range(3)])
     thrice[400:800] += 14
-    steps = level_steps(np.tile(place, (3, 1)), thrice, station)
+    steps = detect_level_steps(np.tile(place, (3, 1)), thrice, station)
     assert [abs(s.first - at) <= 3 for s, at in zip(steps, (400, 800), strict=True)] == [True, True]
     assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(-14, abs=1)
 
 
 def test_no_wolf_on_thirty_sound_walks():
-    alarms = sum(bool(level_steps(*walk(seed, 400))) for seed in range(30))
+    alarms = sum(bool(detect_level_steps(*walk(seed, 400))) for seed in range(30))
     assert alarms == 0
 
 
 def test_steps_of_little_or_wrong_input():
     place, level, station = walk(0)
-    assert level_steps(place[:50], level[:50], station) == ()
-    assert level_steps(np.zeros((600, 2)), level) == () and level_steps(place, level * 0) == ()
-    assert level_steps(place, np.full(600, np.nan)) == ()
+    assert detect_level_steps(place[:50], level[:50], station) == ()
+    assert detect_level_steps(np.zeros((600, 2)), level) == () and detect_level_steps(place, level * 0) == ()
+    assert detect_level_steps(place, np.full(600, np.nan)) == ()
     with pytest.raises(DataError, match="level_steps"):
-        level_steps(place, level[:-1])
+        detect_level_steps(place, level[:-1])
     with pytest.raises(DataError, match="level_steps"):
-        level_steps(np.where(place > 0, np.nan, place), level)
+        detect_level_steps(np.where(place > 0, np.nan, place), level)
 
 
 def test_outages_and_what_was_not_heard():
@@ -171,13 +161,15 @@ def test_outages_and_what_was_not_heard():
     level[100:160, 0] = np.nan  # off
     level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
-    found = plausibility.gaps(as_links(place, level, ["a", "b", "c"]))
+    found = plausibility.gap_warnings(as_links(place, level, ["a", "b", "c"]))
     assert found[0].startswith("no level in the 60 rows from row 100 to row 159 of station a: an outage;")
     assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
     advised = float(found[1].partition("(at most ")[2].split()[0])  # was rounded to one that is refused
     assert advised <= np.nanmin(level[:, 1])
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
-    assert plausibility.gaps(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == ["no level in any row"]
+    assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [
+        "no level in any row"
+    ]
 
 
 def real_links(name):
@@ -194,14 +186,14 @@ def campus():
 
 def test_a_real_station_that_lost_its_gain(campus):
     """One of twelve changes: 17 dB more from row 350 on, 19 dB less from row 1162 on, where it was off."""
-    found = plausibility.changed_levels(campus, plausibility.steps_of(campus))
+    found = plausibility.level_step_warnings(campus, plausibility.find_level_steps(campus))
     assert len(found) == 2 and all("ebc-nuc1" in line for line in found)
     assert "rises by 17 dB between row 349 and row 350" in found[0]
     assert "falls by 19 dB between row 1161 and row 1461" in found[1]
 
 
 def test_real_outages_are_not_taken_for_silence(campus):
-    found = plausibility.gaps(campus)
+    found = plausibility.gap_warnings(campus)
     assert sum("an outage" in line for line in found) == 8
     assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
     assert any(

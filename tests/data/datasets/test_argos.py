@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cities import city, folder
 
-from gsparc.data.datasets.argos import TONES, aligned, load_argos
+from gsparc.data.datasets.argos import TONES, load_argos, remove_uplink_offsets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 
@@ -20,12 +20,8 @@ def _copy(tmp_path, *without: str):
     return place
 
 
-def _flat(uplink, rows):
-    return np.abs(uplink[:, 0, :3]).astype(float)
-
-
 def test_reads_the_release_s_two_files(tmp_path) -> None:
-    data = load_argos(_copy(tmp_path), _flat)
+    data = load_argos(_copy(tmp_path))
     assert data.target.shape[1:] == (1, 26) and data.uplink.shape[1:] == (8, 26)
     assert data.site.moving_end == "rx" and data.site.kind == "csi"
     assert np.allclose(np.diff(data.site.subcarriers_hz), 312.5e3)
@@ -42,8 +38,8 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
     csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
     tones = np.array(TONES, dtype=float)
     moved = csi * np.exp(1j * (1.3 - 0.2 * tones))
-    assert np.allclose(aligned(moved, tones), aligned(csi, tones), atol=1e-12)
-    assert np.allclose(np.abs(aligned(csi, tones)), np.abs(csi))
+    assert np.allclose(remove_uplink_offsets(moved, tones), remove_uplink_offsets(csi, tones), atol=1e-12)
+    assert np.allclose(np.abs(remove_uplink_offsets(csi, tones)), np.abs(csi))
 
 
 @pytest.mark.parametrize(
@@ -62,7 +58,7 @@ def test_bad_folders_are_refused_in_words(tmp_path, change, words) -> None:
     place = _copy(tmp_path)
     change(place)
     with pytest.raises(DataError, match=words):
-        load_argos(place, _flat)
+        load_argos(place)
 
 
 def test_no_such_antenna_or_positions(tmp_path) -> None:
@@ -72,10 +68,9 @@ def test_no_such_antenna_or_positions(tmp_path) -> None:
         load_argos(_copy(tmp_path), positions="true")
 
 
-def test_absent_release_is_loud(tmp_path, caplog) -> None:
-    encoder = {"folder": str(tmp_path / "enc"), "steps": 2, "hidden": 8}
+def test_absent_release_is_loud(caplog) -> None:
     stand_in = {"root": str(folder().parent), "count": 120, "seed": 1}
-    data = load({"name": "argos", "root": None, "stand_in": stand_in, "encoder": encoder})
+    data = load({"name": "argos", "root": None, "stand_in": stand_in})
     assert "SIMULATED" in caplog.text and data.site.stand_in == "argos"
     assert data.moving.shape == (120, 3) and np.ptp(data.moving) > 0
 

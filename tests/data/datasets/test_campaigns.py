@@ -24,8 +24,8 @@ from measured import (
 from releases import real
 
 from gsparc.data.datasets.own import LOADERS, read_any
-from gsparc.data.datasets.powder import raw_of_powder
-from gsparc.data.datasets.techtile import raw_of_techtile
+from gsparc.data.datasets.powder import read_powder
+from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, load
 from gsparc.data.raw import read_netcdf
@@ -35,7 +35,7 @@ EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
 @EVERY_KIND
 def test_techtile_release(tmp_path, kind):
-    raw = raw_of_techtile(write_release(tmp_path, kind))
+    raw = read_techtile(write_release(tmp_path, kind))
     held, rows = raw.arrays, 2 * CYCLES - 2  # one without position, one without channels
     assert held["tx_position"].shape == (rows, 3) and held["tx_position"].dtype == np.float64
     assert held["station_name"].tolist() == HOSTS.tolist()
@@ -57,24 +57,24 @@ def test_techtile_release_of_one_experiment(tmp_path, kind):
         for name, (dimensions, values) in release_variables().items()
     }
     del variables["experiment_id"]
-    held = raw_of_techtile(write_release(tmp_path, kind, variables)).arrays
+    held = read_techtile(write_release(tmp_path, kind, variables)).arrays
     assert held["csi"].shape == (CYCLES, 3) and set(held["run"]) == {"csi"}
 
 
 def test_techtile_release_without_flags(tmp_path):
     variables = {n: v for n, v in release_variables().items() if not n.endswith("_available")}
-    masks = [raw_of_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"] for v in (None, variables)]
+    masks = [read_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"] for v in (None, variables)]
     assert np.array_equal(*masks)
 
 
 def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
     path = write_release(tmp_path)
     table = (tmp_path / "techtile_antenna_locations.yml").rename(tmp_path / "ceiling.yml")
-    assert np.array_equal(raw_of_techtile(path, table).arrays["station_position"], ANTENNAS)
-    refused("name the file with dataset.antennas", raw_of_techtile, path)
+    assert np.array_equal(read_techtile(path, table).arrays["station_position"], ANTENNAS)
+    refused("name the file with dataset.antennas", read_techtile, path)
     variables = {**release_variables(), "rx_antenna_position": (("hostname", "xyz"), ANTENNAS)}
     path = write_release(tmp_path, variables=variables, antennas=False)
-    assert np.array_equal(raw_of_techtile(path).arrays["station_position"], ANTENNAS)
+    assert np.array_equal(read_techtile(path).arrays["station_position"], ANTENNAS)
 
 
 TECHTILE = {
@@ -98,7 +98,7 @@ def test_spoilt_techtile_releases(tmp_path, refused, case):
     variables = {
         name: value for name, value in {**release_variables(), **change}.items() if value is not None
     }
-    refused(says, raw_of_techtile, write_release(tmp_path, variables=variables))
+    refused(says, read_techtile, write_release(tmp_path, variables=variables))
 
 
 ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
@@ -119,7 +119,7 @@ ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: 
 def test_spoilt_tables_of_antennas(tmp_path, refused, text, says):
     path = write_release(tmp_path)
     (tmp_path / "techtile_antenna_locations.yml").write_text(text)
-    refused(says, raw_of_techtile, path)
+    refused(says, read_techtile, path)
 
 
 @EVERY_KIND
@@ -135,7 +135,7 @@ def test_damaged_netcdf(tmp_path, refused, kind):
 def test_values_that_were_never_written_are_none(tmp_path):
     variables = release_variables()
     variables["rover_x"][1][0, 2] = 9.969209968386869e36
-    raw = raw_of_techtile(write_release(tmp_path, variables=variables))
+    raw = read_techtile(write_release(tmp_path, variables=variables))
     assert raw.attributes["left_out"].startswith("2 of 15 cycles")
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
@@ -147,7 +147,7 @@ def equal(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def test_powder_csv_holds_the_same(tmp_path):
-    table, npz = raw_of_powder(write_walk(tmp_path)), raw_of_powder(write_npz(tmp_path, "powder"))
+    table, npz = read_powder(write_walk(tmp_path)), read_powder(write_npz(tmp_path, "powder"))
     assert all(equal(table.arrays[name], npz.arrays[name]) for name in npz.arrays)
     assert np.isnan(table.arrays["rssi_db"]).sum() == 2  # -101 in the release
     assert table.arrays["row_name"][0] == "line 2"
@@ -155,7 +155,7 @@ def test_powder_csv_holds_the_same(tmp_path):
 
 
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
-    raw = raw_of_powder(
+    raw = read_powder(
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
     )
     assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays["rssi_db"].shape == (20, 1)
@@ -182,21 +182,21 @@ WALKS = {  # what is replaced in the walk (None: all of it), the table of statio
 @pytest.mark.parametrize("case", WALKS)
 def test_spoilt_powder_tables(tmp_path, refused, case):
     change, table, says = WALKS[case]
-    refused(says, raw_of_powder, write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table))
+    refused(says, read_powder, write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table))
 
 
 def test_absent_powder_files(tmp_path, refused):
     path = write_walk(tmp_path)
     (tmp_path / "location_coordinates.json").unlink()
-    refused("name the file with dataset.station_table", raw_of_powder, path)
-    refused("no such file", raw_of_powder, tmp_path / "other.csv")
+    refused("name the file with dataset.station_table", read_powder, path)
+    refused("no such file", read_powder, tmp_path / "other.csv")
 
 
 @pytest.mark.parametrize("height", [float("nan"), "high", True, None])
 def test_heights_are_metres(tmp_path, refused, height):
     path = write_npz(tmp_path, "powder")
-    refused("dataset.tx_height=", raw_of_powder, path, None, height)
-    refused("dataset.station_height=", raw_of_powder, path, None, 1.5, height)
+    refused("dataset.tx_height=", read_powder, path, None, height)
+    refused("dataset.station_height=", read_powder, path, None, 1.5, height)
 
 
 EVERY = pytest.mark.parametrize("name", MAKERS)
@@ -227,7 +227,7 @@ def test_settings_that_cannot_be(tmp_path, refused, settings, says):
 def test_techtile_is_links_to_antennas(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         data = load({"name": "techtile", "file": str(write_release(tmp_path))})
-    stations, arrays = data.site.stations, raw_of_techtile(tmp_path / "csi.nc").arrays
+    stations, arrays = data.site.stations, read_techtile(tmp_path / "csi.nc").arrays
     assert data.site.kind == "csi" and data.site.static_end == "rx" and data.site.carrier_hz == 920e6
     assert np.allclose(stations.position + data.site.origin, ANTENNAS) and stations.name == tuple(HOSTS)
     assert len(data) == arrays["mask"].sum() and data.target.shape == (len(data), 1, 1)
@@ -278,7 +278,7 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
 
 def test_measured_stations_lie_where_the_release_says():
     path = real("real/powder-rss-462mhz.npz")
-    held = raw_of_powder(path).arrays
+    held = read_powder(path).arrays
     assert held["rssi_db"].shape == (5006, 12) and np.nanmin(held["rssi_db"]) > -101
     station = held["station_name"].tolist().index("ebc-nuc1-b210")
     where = [held[f"station_{axis}"][station] for axis in ("latitude", "longitude")]

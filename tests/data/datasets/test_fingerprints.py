@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from releases import real
 
-from gsparc.data.datasets.fingerprints import Fingerprints, parted, read_fingerprints
+from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
 from gsparc.data.errors import DataError
 
 NAN = np.nan
@@ -28,8 +28,8 @@ def test_archive_is_read(tmp_path):
     rows = read_fingerprints(file)
     assert rows.level.dtype == np.float32 and rows.position.dtype == np.float64
     assert rows.floor.tolist() == [3] * 4 and rows.access_point.tolist() == ["0", "1"]
-    assert [part.tolist() for part in parted(rows)] == [[0, 2, 3], [1]]
-    assert [part.tolist() for part in parted(rows, "later")] == [[0], [1, 2, 3]]
+    assert [part.tolist() for part in split_fingerprints(rows)] == [[0, 2, 3], [1]]
+    assert [part.tolist() for part in split_fingerprints(rows, "later")] == [[0], [1, 2, 3]]
     flat = read_fingerprints(written(tmp_path / "b.npz", position=arrays()["position"][:, :2]))
     assert flat.position.shape == (4, 3) and not flat.position[:, 2].any()
 
@@ -95,15 +95,15 @@ def test_splits_hold_out_whole_units():
         ("blocks", np.floor(rows.position[:, :2] / 4)),
         ("walks", rows.walk[:, None]),
     ):
-        train, test = parted(rows, how, side_m=4.0)
+        train, test = split_fingerprints(rows, how, side_m=4.0)
         assert len(test) > 10 and not set(train) & set(test) and len(train) + len(test) == 200
         assert not {tuple(u) for u in unit[train]} & {tuple(u) for u in unit[test]}, how
-        np.testing.assert_array_equal(test, parted(rows, how, side_m=4.0)[1])
+        np.testing.assert_array_equal(test, split_fingerprints(rows, how, side_m=4.0)[1])
     for how in ("released", "later"):
         with pytest.raises(DataError, match="names no such rows"):
-            parted(rows, how)
+            split_fingerprints(rows, how)
     with pytest.raises(DataError, match=r"'walk' is none of .*did you mean 'walks'"):
-        parted(rows, "walk")
+        split_fingerprints(rows, "walk")
 
 
 def test_columns_are_those_of_another_campaign():
@@ -121,7 +121,7 @@ def test_columns_are_those_of_another_campaign():
 )  # fmt: skip
 def test_files_of_the_campaigns(name, how, count):
     rows = read_fingerprints(real(name))
-    train, test = parted(rows, how)
+    train, test = split_fingerprints(rows, how)
     assert np.isfinite(rows.level).any(1).mean() > 0.99
     assert len(train) + len(test) == len(rows.level) and len(test) == count
 

@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from releases import real, write_release
 
-from gsparc.data.datasets.ble import raw_of_ble
-from gsparc.data.datasets.newrf import raw_of_newrf
+from gsparc.data.datasets.ble import read_ble
+from gsparc.data.datasets.newrf import read_newrf
 from gsparc.data.datasets.own import read_any
-from gsparc.data.datasets.powder import raw_of_powder
+from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.datasets.techtile_power import raw_of_techtile_power
+from gsparc.data.datasets.techtile_power import read_techtile_power
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.pickles import FRAMES, unpickled
+from gsparc.data.pickles import FRAMES, read_pickle
 
 ROOM = "releases/newrf/dataset_conference_ch1_rt_image_fc.pkl"
 
 
 def test_newrf_room_is_what_was_converted_from_it(real_newrf):
-    released, converted = raw_of_newrf(real(ROOM)).arrays, raw_of_newrf(real_newrf).arrays
+    released, converted = read_newrf(real(ROOM)).arrays, read_newrf(real_newrf).arrays
     assert len(released["csi"]) == 433
     for name in set(converted) - {"split_train", "split_test"}:
         assert np.abs(released[name].astype(complex) - converted[name]).max() <= 1e-6, name
@@ -52,7 +52,7 @@ def test_newrf_rows_with_a_missing_value_are_left_out(tmp_path):
     table = frame()
     table.at[3, "CSI"] = np.nan
     table.to_pickle(tmp_path / "room.pkl")
-    arrays = raw_of_newrf(tmp_path / "room.pkl").arrays
+    arrays = read_newrf(tmp_path / "room.pkl").arrays
     assert len(arrays["csi"]) == 7 and arrays["path_offsets"][-1] == 28 == len(arrays["path_gain"])
     assert arrays["csi"][3] == np.complex64(table["CSI"][4][0]) and arrays["frequency_hz"] == 2.412e9
 
@@ -91,7 +91,7 @@ def test_a_pickle_runs_nothing(tmp_path, monkeypatch, case):
     content, says = SPOILT[case]
     (tmp_path / "room.pkl").write_bytes(content)
     with pytest.raises(DataError, match=says) as error:
-        raw_of_newrf(tmp_path / "room.pkl")
+        read_newrf(tmp_path / "room.pkl")
     assert not (tmp_path / "ran").exists() and str(error.value).startswith(f"{tmp_path}/room.pkl: ")
 
 
@@ -101,15 +101,15 @@ def test_pickled_arrays_of_every_protocol(tmp_path, protocol):
         "a": np.arange(6.0).reshape(2, 3), "b": np.array([np.ones(2), "x", None], object), "c": np.float32(2),
     }  # fmt: skip
     (tmp_path / "x.pkl").write_bytes(pickle.dumps(held, protocol))
-    found = unpickled(tmp_path / "x.pkl", FRAMES)
+    found = read_pickle(tmp_path / "x.pkl", FRAMES)
     assert np.array_equal(found["a"], held["a"]) and found["c"] == 2 and found["b"][1] == "x"
 
 
 def test_newrf_tables_without_a_column_or_of_two_rooms(tmp_path, refused):
     frame().drop(columns="CSI").to_pickle(tmp_path / "a.pkl")
-    refused("no columns CSI; it holds TxPos", raw_of_newrf, tmp_path / "a.pkl")
+    refused("no columns CSI; it holds TxPos", read_newrf, tmp_path / "a.pkl")
     frame(Frequency=[2.4, 5.8] * 4).to_pickle(tmp_path / "b.pkl")
-    refused("several transmitters or frequencies", raw_of_newrf, tmp_path / "b.pkl")
+    refused("several transmitters or frequencies", read_newrf, tmp_path / "b.pkl")
     frame(LastXPts=[np.ones((2, 4))] * 8).to_pickle(tmp_path / "c.pkl")
     refused(
         "path_last_point|not the table of a room",
@@ -119,7 +119,7 @@ def test_newrf_tables_without_a_column_or_of_two_rooms(tmp_path, refused):
 
 
 def test_ble_folder_is_what_was_converted_from_it():
-    released, converted = (raw_of_ble(real(n)).arrays for n in ("releases/ble-hall", "real/ble-hall-1.npz"))
+    released, converted = (read_ble(real(n)).arrays for n in ("releases/ble-hall", "real/ble-hall-1.npz"))
     assert released["rssi_db"].shape == (7, 12)
     assert np.array_equal(released["station_position"], converted["station_position"])
     assert released["station_name"].tolist() == converted["station_name"].tolist()
@@ -149,7 +149,7 @@ def hall(root: Path) -> Path:
 
 
 def test_ble_sets_and_what_was_not_heard(tmp_path):
-    first, second = (raw_of_ble(hall(tmp_path / str(n)), hall=n).arrays for n in (1, 2))
+    first, second = (read_ble(hall(tmp_path / str(n)), hall=n).arrays for n in (1, 2))
     assert first["tx_position"].tolist() == [[9.5, -2, 1.85], [10.5, 2, 1.85]]
     assert np.isnan(first["rssi_db"]).tolist() == [[False, False], [False, True]]
     assert (second["rssi_db"] == -63).all() and np.nanmax(first["rssi_db"]) == -62
@@ -173,13 +173,13 @@ def test_spoilt_ble_folders(tmp_path, refused, case):
     file.unlink(missing_ok=True)
     if text is not None:
         file.write_text(text)
-    refused(says, raw_of_ble, tmp_path / "hall")
-    refused("no \\*.mbd files", raw_of_ble, hall(tmp_path / "other"), 3)
+    refused(says, read_ble, tmp_path / "hall")
+    refused("no \\*.mbd files", read_ble, hall(tmp_path / "other"), 3)
 
 
 def test_powder_table_is_what_was_converted_from_it():
-    released = raw_of_powder(real("releases/powder/single_tx.csv")).arrays
-    converted = raw_of_powder(real("real/powder-rss-462mhz.npz")).arrays
+    released = read_powder(real("releases/powder/single_tx.csv")).arrays
+    converted = read_powder(real("real/powder-rss-462mhz.npz")).arrays
     shared = [converted["station_name"].tolist().index(name) for name in released["station_name"]]
     assert len(shared) == 12
     # Every eighth row of the release.
@@ -214,7 +214,7 @@ def plane(folder: Path, places, powers, module="Positioner") -> Path:
 
 def test_techtile_power_of_pickled_objects(tmp_path, caplog):
     folder = plane(tmp_path / "RECI-RF-1", np.eye(4, 3) + 3, [58_600_000.0, 1e6, 1e9, 0])
-    arrays = raw_of_techtile_power(folder).arrays
+    arrays = read_techtile_power(folder).arrays
     assert np.allclose(arrays["rssi_db"], [-12.321, -30, 0], atol=1e-3)  # of 58.6, 1 and 1,000 microwatts
     assert np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3))
     assert arrays["frequency_hz"] == 920e6
@@ -226,12 +226,12 @@ def test_techtile_power_of_pickled_objects(tmp_path, caplog):
 
 def test_techtile_power_of_other_objects(tmp_path, refused):
     other = plane(tmp_path / "a", np.eye(3), [1.0] * 3, module="elsewhere")
-    refused(r"17_positions.npy: asks for elsewhere\.PositionerValue", raw_of_techtile_power, other)
+    refused(r"17_positions.npy: asks for elsewhere\.PositionerValue", read_techtile_power, other)
     longer = plane(tmp_path / "b", np.eye(3), [1.0] * 2)
-    refused("3 positions, but 2 values", raw_of_techtile_power, longer)
+    refused("3 positions, but 2 values", read_techtile_power, longer)
     (longer / "17_values.npy").unlink()
-    refused("17_values.npy: no such file", raw_of_techtile_power, longer)
-    refused("expected one \\*_positions.npy", raw_of_techtile_power, tmp_path)
+    refused("17_values.npy: no such file", read_techtile_power, longer)
+    refused("expected one \\*_positions.npy", read_techtile_power, tmp_path)
 
 
 def test_rfid_list_of_our_tables_is_out_of_the_200(real_rfid, tmp_path):

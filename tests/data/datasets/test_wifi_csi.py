@@ -9,7 +9,7 @@ import pytest
 from releases import real
 
 from gsparc.data.datasets.own import read_any
-from gsparc.data.datasets.wifi_csi import raw_of_wifi_csi
+from gsparc.data.datasets.wifi_csi import read_wifi_csi
 from gsparc.data.datasets.wsr import RECORD, SPACING_HZ, TONES, read_log
 from gsparc.data.load import load
 
@@ -38,7 +38,7 @@ def standard(content: bytes) -> bytes:
 def test_a_folder_of_nexmon_with_its_places(caplog):
     caplog.set_level(logging.INFO)
     folder = real("nexmon")
-    raw = raw_of_wifi_csi(folder).arrays
+    raw = read_wifi_csi(folder).arrays
     tone = (raw["frequency_hz"] - 5.24e9) / SPACING_HZ
     assert tone.tolist() == [*range(-26, 0), *range(1, 27)]
     assert "52 of 64 subcarriers" in caplog.text and "the level of each row is its RSSI" in caplog.text
@@ -64,61 +64,46 @@ def test_tones_of_channels_from_a_transmitter_at_an_unknown_place_were_said_to_b
 def test_packets_of_an_intel_5300_along_a_track(robot):
     log = read_log(robot)
     settings = {"places": robot.with_name("way.csv"), "carrier_hz": CARRIER}
-    raw = raw_of_wifi_csi(robot, transmitters={"00:21:6a:30:d2:3c": (1, 2, 3)}, **settings).arrays
+    raw = read_wifi_csi(robot, transmitters={"00:21:6a:30:d2:3c": (1, 2, 3)}, **settings).arrays
     assert np.allclose(raw["frequency_hz"], CARRIER + SPACING_HZ * TONES)
     assert np.allclose(raw["rx_position"][:, 0], (log.time - 1624839900) / 10)
     assert np.allclose(raw["csi"], log.csi.swapaxes(1, 2)) and len(raw["station_name"]) == 3
     assert np.isfinite(raw["station_position"]).all(axis=1).sum() == 1
     robot.with_name("way.csv").write_text("file,x,y\nrx.dat,1,2\n")
     robot.write_bytes(standard(robot.read_bytes()))
-    plain = raw_of_wifi_csi(robot, **settings).arrays
+    plain = read_wifi_csi(robot, **settings).arrays
     assert np.allclose(plain["csi"], raw["csi"], rtol=1e-5)  # by `csiread`, and by our own reader
     assert (plain["rx_position"] == [1, 2, 0]).all()
     assert np.ptp(plain["time_s"]) == pytest.approx(np.ptp(raw["time_s"]), abs=0.01)
 
 
-def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
-    rng = np.random.default_rng(0)
-    parts = rng.integers(20, 90, (5, 128))
-    parts[:, 20:22] = 0  # subcarrier 10
-    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
-    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
-    (tmp_path / "walk.csv").write_text("".join(lines))
-    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
-    raw = raw_of_wifi_csi(tmp_path).arrays
-    assert raw["frequency_hz"].mean() == pytest.approx(2.437e9, abs=SPACING_HZ)
-    tone = ((raw["frequency_hz"] - 2.437e9) / SPACING_HZ).round()
-    assert len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
-
-
-def test_a_packet_of_zeros_made_all_levels_nan(tmp_path, caplog):
-    parts = np.random.default_rng(0).integers(20, 90, (5, 128))
-    parts[2] = 0
-    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
-    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
-    (tmp_path / "walk.csv").write_text("".join(lines))
-    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
-    raw = raw_of_wifi_csi(tmp_path).arrays
-    assert len(raw["csi"]) == 4 and np.isfinite(raw["csi"]).all() and "1 packets" in caplog.text
+def test_a_packet_of_zeros_made_all_levels_nan(robot, caplog):
+    records = np.frombuffer(robot.read_bytes(), RECORD).copy()
+    records["csi"][2] = 0
+    robot.write_bytes(records.tobytes())
+    raw = read_wifi_csi(robot, robot.with_name("way.csv"), carrier_hz=CARRIER).arrays
+    assert len(raw["csi"]) == len(records) - 1 and np.isfinite(raw["csi"]).all()
+    assert "1 packets" in caplog.text
 
 
 def test_logs_that_are_none(robot, tmp_path, refused, monkeypatch):
-    refused("places.csv: missing; expected a table of places", raw_of_wifi_csi, robot)
+    refused("places.csv: missing; expected a table of places", read_wifi_csi, robot)
     table = tmp_path / "places.csv"
     table.write_text("file,z\nrx.dat,1\n")
-    refused("columns file, z; expected x, y", raw_of_wifi_csi, robot)
+    refused("columns file, z; expected x, y", read_wifi_csi, robot)
     table.write_text("file,x,y\nother.dat,1,2\n")
-    refused("no packet has a place", raw_of_wifi_csi, robot)
+    refused("no packet has a place", read_wifi_csi, robot)
     table.write_text("file,x,y\nrx.dat,1,two\n")
-    refused("places.csv: could not convert", raw_of_wifi_csi, robot)
+    refused("places.csv: could not convert", read_wifi_csi, robot)
     table.write_text("file,x,y\nrx.dat,1,2\n")
-    refused("say dataset.carrier_hz", raw_of_wifi_csi, robot)
+    refused("say dataset.carrier_hz", read_wifi_csi, robot)
     sound = standard(robot.read_bytes())
     robot.write_bytes(b"\xff\xf0" + sound[2:])  # longer than the buffer of csiread
-    refused("byte 0: a record of 65520 bytes", raw_of_wifi_csi, robot, None, None, "43455c0", CARRIER)
+    refused("byte 0: a record of 65520 bytes", read_wifi_csi, robot, None, "43455c0", CARRIER)
     robot.write_bytes(b"")
-    refused("no packet with a channel in it", raw_of_wifi_csi, robot, None, None, "43455c0", CARRIER)
-    refused("expected those of one of 20, 40, 80 MHz", raw_of_wifi_csi, robot, None, "nexmon")
-    refused("no such log", raw_of_wifi_csi, tmp_path / "absent", table)
+    refused("no packet with a channel in it", read_wifi_csi, robot, None, "43455c0", CARRIER)
+    capture = robot.rename(robot.with_suffix(".pcap"))
+    refused("expected those of one of 20, 40, 80 MHz", read_wifi_csi, capture)
+    refused("no such log", read_wifi_csi, tmp_path / "absent", table)
     monkeypatch.setitem(sys.modules, "csiread", None)
-    refused("pip install 'gsparc\\[wifi\\]'", raw_of_wifi_csi, robot)
+    refused("pip install 'gsparc\\[wifi\\]'", read_wifi_csi, capture)

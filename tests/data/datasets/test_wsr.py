@@ -15,10 +15,10 @@ from gsparc.data.datasets.wsr import (
     SPACING_HZ,
     TONES,
     _square,
-    followed,
-    raw_of_wsr,
+    follow_root,
     read_log,
-    without_slope,
+    read_wsr,
+    remove_delay_slope,
 )
 from gsparc.data.load import load
 
@@ -99,7 +99,7 @@ def unexplained(found: np.ndarray, truth: np.ndarray) -> float:
 def true_root(where, transmitter) -> np.ndarray:
     """The channel without the slope of its square, which the clocks hide."""
     h = channel(where, transmitter)
-    twice = without_slope(h**2) / h**2
+    twice = remove_delay_slope(h**2) / h**2
     step = np.angle(twice[:, 1] / twice[:, 0]) / 2  # between tones -28 and -26
     return h * np.exp(0.5j * step[:, None] * TONES)
 
@@ -107,7 +107,7 @@ def true_root(where, transmitter) -> np.ndarray:
 def test_the_channel_comes_back_up_to_a_factor_for_each_run(tmp_path):
     for i in range(2):
         drive(tmp_path / f"L{i}", f"t{i}", seed=i)
-    raw = raw_of_wsr(tmp_path).arrays
+    raw = read_wsr(tmp_path).arrays
     assert len(set(raw["run"])) == 6 and set(raw["station"]) == {0, 1, 2}
     assert 30 <= np.min(np.unique(raw["run"], return_counts=True)[1]) <= 40  # .6 m in steps of 16 mm
     for run in np.unique(raw["run"]):
@@ -121,7 +121,7 @@ def test_the_channel_comes_back_up_to_a_factor_for_each_run(tmp_path):
 
 def test_a_gap_begins_a_run(tmp_path):
     drive(tmp_path, lost=slice(300, 330))  # 2 cm without a packet
-    assert set(raw_of_wsr(tmp_path, spacing_m=0.02).arrays["run"]) == {
+    assert set(read_wsr(tmp_path, spacing_m=0.02).arrays["run"]) == {
         f"t1 {tx} {part}" for tx in LOS_SET_A for part in (0, 1)
     }
 
@@ -129,7 +129,7 @@ def test_a_gap_begins_a_run(tmp_path):
 def test_the_root_is_followed_through_a_fade():
     t = np.linspace(-1, 1, 400)[:, None]
     h = np.exp(3j * t) * (t + 0.1j + 0.2 * np.linspace(-1, 1, 30))
-    assert unexplained(followed(h**2), h) < 1e-12
+    assert unexplained(follow_root(h**2), h) < 1e-12
 
 
 def test_pieces_of_the_release():
@@ -154,7 +154,7 @@ def test_pieces_of_the_release():
 
 
 def test_archives_read_as_they_did():
-    held = raw_of_wsr(real("ofdm/wsr-nlos-a.npz")).arrays
+    held = read_wsr(real("ofdm/wsr-nlos-a.npz")).arrays
     with np.load(real("ofdm/wsr-nlos-a.npz")) as archive:
         good = archive["good"]
         assert np.allclose(held["csi"] ** 2, archive["h2"][good], rtol=1e-5)
@@ -163,16 +163,16 @@ def test_archives_read_as_they_did():
 
 
 def test_logs_that_are_none(tmp_path, refused):
-    refused("no csi_rx_\\*.dat in it", raw_of_wsr, tmp_path)
+    refused("no csi_rx_\\*.dat in it", read_wsr, tmp_path)
     drive(tmp_path, packets=60)
-    refused("no packet was heard at both ends while the robot drove", raw_of_wsr, tmp_path, None, 5.0)
-    refused("csi_tx9_t1.dat: missing", raw_of_wsr, tmp_path, {"tx9": (0, 0, 0)})
+    refused("no packet was heard at both ends while the robot drove", read_wsr, tmp_path, None, 5.0)
+    refused("csi_tx9_t1.dat: missing", read_wsr, tmp_path, {"tx9": (0, 0, 0)})
     log = tmp_path / "csi_tx2_t1.dat"
     sound = log.read_bytes()
     log.write_bytes(sound[: 2 * RECORD.itemsize] + b"\0" + sound[2 * RECORD.itemsize :])
-    refused("csi_tx2_t1.dat, record 2: expected packets of an Intel 5300", raw_of_wsr, tmp_path)
+    refused("csi_tx2_t1.dat, record 2: expected packets of an Intel 5300", read_wsr, tmp_path)
     log.write_bytes(b"")
-    refused("csi_tx2_t1.dat, record 0: expected packets", raw_of_wsr, tmp_path)
+    refused("csi_tx2_t1.dat, record 0: expected packets", read_wsr, tmp_path)
     log.write_bytes(sound)
     (tmp_path / "rx_trajectory_t1_.csv").write_text("1,2\n3\n")
-    refused("rx_trajectory_t1_.csv: expected lines that begin with the time", raw_of_wsr, tmp_path)
+    refused("rx_trajectory_t1_.csv: expected lines that begin with the time", read_wsr, tmp_path)

@@ -5,8 +5,8 @@ import pytest
 from networks import network
 from releases import real
 
-from gsparc.data.datasets.powder import raw_of_powder
-from gsparc.data.links.strongest import moments
+from gsparc.data.datasets.powder import read_powder
+from gsparc.data.links.strongest import number_lists
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 
@@ -33,7 +33,7 @@ def test_lists_are_taken_for_none_where_nobody_wants_it():
 
 
 def test_outages_are_no_lists():
-    raw = raw_of_powder(real("real/powder-rss-462mhz.npz"))
+    raw = read_powder(real("real/powder-rss-462mhz.npz"))
     assert interpret(raw, "powder").data.censored is None
 
 
@@ -55,6 +55,6 @@ def test_rows_have_levels_of_their_own():
 
 def test_moments_of_one_place():
     place, station = np.array([0, 0, 0, 0, 1, 1]), np.array([1, 2, 1, 3, 1, 2])
-    assert moments(place, station).tolist() == [0, 0, 1, 1, 2, 2]
+    assert number_lists(place, station).tolist() == [0, 0, 1, 1, 2, 2]
     apart = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
-    assert moments(apart, np.repeat([1, 2, 3], 3)).tolist() == apart.tolist()
+    assert number_lists(apart, np.repeat([1, 2, 3], 3)).tolist() == apart.tolist()

@@ -18,7 +18,7 @@ from gsparc.commands import data as command
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule
 from gsparc.data.public import fetch as fetching
-from gsparc.data.public.fetch import fetch, fetched, public_sets
+from gsparc.data.public.fetch import fetch, fetched_path, public_sets
 
 ONE, TWO = os.urandom(3000), b"x,y,z\n" * 200
 
@@ -210,7 +210,7 @@ def test_a_fetch_that_was_killed_is_said_again(mirror, monkeypatch, tmp_path):
     assert len(list(room.folder.glob("tmp*"))) == 1  # begun, and left
     with pytest.raises(DataError, match="gsparc data room"):
         offer(monkeypatch, tmp_path, *room.sources, dataset="newrf")
-        fetched("newrf")
+        fetched_path("newrf")
     fetch("room", retries=0)
     assert sorted(path.name for path in room.folder.iterdir()) == [".lock", "1.bin"]
 

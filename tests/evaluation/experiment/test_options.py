@@ -267,8 +267,8 @@ def test_phases_of_snapshots_mean_nothing_to_powers():
 def test_what_other_processes_read_counts():
     """Stations fitted by joblib: everything would be named, as nothing was read here."""
     given = "model=idw", "stations=each", "model.neighbours=4", "model.power=1.0", "trainer.max_steps=3"
-    executor.use(Engine("joblib", 2))
+    executor.use_engine(Engine("joblib", 2))
     try:
         assert fitted("stations", *given)[0] == {"trainer.max_steps"}
     finally:
-        executor.use(Engine())
+        executor.use_engine(Engine())

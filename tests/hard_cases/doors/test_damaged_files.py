@@ -56,7 +56,7 @@ def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
 def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
     monkeypatch.setattr(raw_files, "READ", "import time; time.sleep(60)")
-    assert "cannot be read in 0.5 s" in str(raw_files.read_error(path, seconds=0.5))
+    assert "cannot be read in 0.5 s" in str(raw_files.hdf5_text_error(path, seconds=0.5))
     monkeypatch.setattr(raw_files, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
@@ -78,6 +78,6 @@ def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     spoilt[spoilt.index(raw_files.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(raw_files.read_error, "__defaults__", (3.0,))
+    monkeypatch.setattr(raw_files.hdf5_text_error, "__defaults__", (3.0,))
     with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 3 s\)"):
         load_own(path)

@@ -22,7 +22,7 @@ from gsparc.models.channels.terms import Direct, Images, Isotropic, Noise
 from gsparc.models.channels.terms.term import Frame
 from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import reflect
-from gsparc.simulate.shoebox import Room, images
+from gsparc.simulate.shoebox import Room, mirror_images
 
 K = 2 * np.pi / WAVELENGTH
 WALL = np.array([np.cos(0.3), np.sin(0.3), 0.0, 2.1])  # no axis of the room
@@ -127,7 +127,7 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
     wavenumber = 2 * np.pi * carrier / 299792458.0
     place = np.c_[rng.uniform(1.5, 4.5, 110), rng.uniform(1, 3, 110), rng.uniform(0.8, 1.1, 110)]
     end = np.c_[rng.uniform(0.4, 5.6, 12), rng.uniform(0.4, 3.6, 12), np.full(12, 2.3)]
-    mirror = images(Room.uniform(size, -0.6), 2)
+    mirror = mirror_images(Room.uniform(size, -0.6), 2)
     away = np.linalg.norm(place[:, None, None] - mirror.of(end)[None], axis=-1)
     channel = (np.exp(-1j * wavenumber * away) / away) @ mirror.gain
     heard = np.arange(9)

@@ -16,7 +16,7 @@ from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, nonnegative_powers
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import SpectrumLags
-from gsparc.simulate.shoebox import images
+from gsparc.simulate.shoebox import mirror_images
 from gsparc.training.context import FitContext
 
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
@@ -53,7 +53,7 @@ def test_the_strong_images_are_found(data):
     receivers = torch.from_numpy(data.moving[:60]).float()
     given = space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
     found = find_sources(*given, lambda: False)
-    mirrored = images(ROOM, 1).of(TRANSMITTER)
+    mirrored = mirror_images(ROOM, 1).of(TRANSMITTER)
     above = mirrored[mirrored[:, 2] > 0] - site.origin
     distance = np.linalg.norm(above[:, None] - found.numpy()[None], axis=-1).min(1)
     assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3

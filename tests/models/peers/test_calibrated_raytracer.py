@@ -16,10 +16,10 @@ from gsparc.simulate.calibration import (
     GENERIC,
     Material,
     Replay,
-    apply,
+    apply_materials,
     calibrate,
-    gain_and_scale,
-    student,
+    fit_gain_and_scale,
+    student_loss,
     used_materials,
 )
 from gsparc.simulate.effects import PropagationEffects
@@ -53,20 +53,20 @@ def said(scene: SceneSettings) -> dict[str, str]:
 
 def test_slopes_of_the_residuals_density():
     residual, scale = np.array([-20.0, -1.0, 0.3, 5.0]), 2.5
-    slopes = student(residual, scale)[1]
+    slopes = student_loss(residual, scale)[1]
     for row, step in enumerate(1e-5 * np.eye(4)):
-        change = student(residual + step, scale)[0] - student(residual - step, scale)[0]
+        change = student_loss(residual + step, scale)[0] - student_loss(residual - step, scale)[0]
         assert slopes[row] == pytest.approx(change / 2e-5, rel=1e-6)
 
 
 def test_gain_and_scale_are_the_likeliest():
     rng = np.random.default_rng(0)
     missed = 7 + 3 * rng.standard_t(4, 200)
-    gain, scale = gain_and_scale(missed)
-    least = student(gain - missed, scale)[0]
+    gain, scale = fit_gain_and_scale(missed)
+    least = student_loss(gain - missed, scale)[0]
     assert gain == pytest.approx(7, abs=0.8) and scale == pytest.approx(3, rel=0.2)
     for other in ((gain + 0.1, scale), (gain - 0.1, scale), (gain, scale * 1.03), (gain, scale / 1.03)):
-        assert student(other[0] - missed, other[1])[0] > least
+        assert student_loss(other[0] - missed, other[1])[0] > least
 
 
 @pytest.mark.parametrize("scene, words", [
@@ -109,7 +109,7 @@ def test_other_data_are_refused():
 @pytest.fixture(scope="module")
 def wall():
     try:
-        llvm.prepare()
+        llvm.prepare_llvm()
     except llvm.SimulatorMissing as missing:
         pytest.skip(str(missing))
     return RayTracer("floor_wall", STATION, CARRIER_HZ, Sampling(20_000, 100))
@@ -152,7 +152,7 @@ def test_steps_compile_nothing(wall):
 
 @pytest.mark.slow
 def test_a_replay_is_the_trace(wall):
-    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
     traced = wall.trace(places(), PLAIN).received_power()
     np.testing.assert_allclose(Replay(wall, places(), PLAIN).powers(), traced, rtol=1e-4)
 
@@ -161,10 +161,10 @@ def test_a_replay_is_the_trace(wall):
 def test_gain_and_powers_elsewhere_are_found_again(wall):
     """Not the materials one by one: sheets resonate, and several explain the powers alike."""
     materials, learned = used_materials(wall), slice(0, 60)
-    apply(wall, dict.fromkeys(materials, TRUE))
+    apply_materials(wall, dict.fromkeys(materials, TRUE))
     measured = 10 * np.log10(wall.trace(places(90), PLAIN).received_power()) + GAIN_DB
     start = dict.fromkeys(materials, GENERIC)
-    apply(wall, start)
+    apply_materials(wall, start)
     replay = Replay(wall, places(90)[learned], PLAIN)
     found = calibrate(replay, start, replay.powers(), measured[learned], 80)
     assert found.gain_db == pytest.approx(GAIN_DB, abs=0.3) and found.scale_db == 0.5
@@ -174,7 +174,7 @@ def test_gain_and_powers_elsewhere_are_found_again(wall):
 
 @pytest.mark.slow
 def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
-    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
     power = wall.trace(places(), PLAIN).received_power() * 10 ** (GAIN_DB / 10)
     scene = SceneSettings("floor_wall", 30, CARRIER_HZ, 0.0, 1, builtin="floor_wall")
     data = measurements(power, **said(scene))
@@ -196,7 +196,7 @@ def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
 
 @pytest.mark.slow
 def test_channels_are_predicted_up_to_one_factor(wall):
-    apply(wall, dict.fromkeys(used_materials(wall), TRUE))
+    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
     tones = CARRIER_HZ + np.linspace(-2e7, 2e7, 4)
     csi = wall.trace(places(), PLAIN).responses(tones, np.zeros((1, 3)), wall.wavelength) * 3j
     data = from_arrays(

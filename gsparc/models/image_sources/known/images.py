@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from gsparc.data.walls import SceneWalls, area, box_faces, normal_of
+from gsparc.data.walls import SceneWalls, box_faces, polygon_area, polygon_normal
 from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images, normal_form
@@ -191,8 +191,8 @@ def _sides(patches: Tensor) -> Tensor:
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
     """Planes (4,) and the faces on each; the largest face gives the plane."""
     planes: list[tuple[np.ndarray, list[np.ndarray]]] = []
-    for face in sorted(faces, key=area, reverse=True):
-        normal = normal_of(face)
+    for face in sorted(faces, key=polygon_area, reverse=True):
+        normal = polygon_normal(face)
         normal = normal / np.linalg.norm(normal)
         for (*other, offset), members in planes:
             apart = np.abs(face @ other - offset).max()

@@ -11,7 +11,7 @@ from networks import Network, judged, network, reference
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.data.units import in_decibels
+from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
@@ -46,7 +46,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
         tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
         said = method.of(number).predict(Query(tx, rx))
         assert said.variance is not None
-        result.append(in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
+        result.append(power_in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
     mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))
     return mean + 10 * np.log10(site.target_scale), spread
 

@@ -1,0 +1,75 @@
+"""Rows of stations that were not heard, which a file of links leaves out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.links.strongest import StrongestLists, number_lists
+from gsparc.data.own_checks import Checker
+from gsparc.data.schema import OTHER, End, Stations
+from gsparc.data.selection import take_rows
+
+LEAST_LISTED = 3  # stations, for lists of the strongest
+UNLISTED_EACH = 2  # rows of what is not listed for one that is
+
+
+def add_absent(check: Checker, measured: str, count: int) -> None:
+    """Add a row that was not heard for each place and station, of `count`, without one."""
+    if measured != "rssi_db":
+        return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
+    arrays = check.raw.arrays
+    _, first, of_place = np.unique(arrays["place"], return_index=True, return_inverse=True)
+    # Links are numbered place by station, so that those without a row are a set difference.
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + arrays["station"])
+    floor = _floors(arrays, count)
+    # Minus infinity lies below whatever turns out to be the limit of hearing.
+    _repeat(check, np.r_[: len(of_place), first[lost // count]], lost % count)
+    if floor is not None and floor.ndim:
+        check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[lost % count]
+    check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+
+
+def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
+    """Add to lists of the strongest rows, twice as many as are listed, of stations that they leave out."""
+    arrays, count = check.raw.arrays, len(stations)
+    levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
+    whole = levels.ndim == 1 and levels.dtype.kind in "iuf" and "mask" not in arrays
+    heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
+    if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
+        return
+    moment = number_lists(arrays["place"][heard], of[heard])
+    moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
+    lists = StrongestLists.of(moment, of[heard], levels[heard], moving, count)
+    if not lists.recognised():
+        return
+    # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
+    floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
+    of_list, station, below = lists.unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
+    _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
+    check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
+    check.notes.append(
+        f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
+        f" below its weakest, in others below {floor.min():.4g} dB; {len(below)} such rows beside"
+        f" {len(heard)} listed, those that tell most (dataset.absent=unknown takes none)"
+    )
+
+
+def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:
+    """The sensitivity (), or (T,) of `count` stations where their rows agree; None elsewhere, or without."""
+    floor = arrays.get("sensitivity_db")
+    if floor is None or floor.ndim == 0:
+        return floor
+    each = np.full(count, floor.min())
+    each[arrays["station"]] = floor
+    return each if np.array_equal(each[arrays["station"]], floor, equal_nan=True) else None
+
+
+def _repeat(check: Checker, like: np.ndarray, station: np.ndarray) -> None:
+    """Take rows `like` (n,); the last of them are of stations (m,) that were not heard there."""
+    arrays = take_rows(check.raw.arrays, like, len(check.raw.arrays["station"]))
+    heard = len(like) - len(station)
+    arrays["station"] = np.r_[arrays["station"][:heard], station]
+    arrays["rssi_db"] = np.r_[arrays["rssi_db"][:heard].astype(np.float64), np.full(len(station), -np.inf)]
+    check.raw = replace(check.raw, arrays=arrays)

@@ -1,0 +1,166 @@
+"""Which powers were measured, and which are only known to be below or above a level."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.blocks import is_big
+from gsparc.data.checks.plausibility import find_not_heard_marks, find_saturation
+from gsparc.data.errors import Caution
+from gsparc.data.limits import number, or_word
+from gsparc.data.own_checks import Checker
+from gsparc.data.schema import Links
+from gsparc.data.selection import take_rows
+
+POWERS = ("rssi", "rssi_db")
+NOT_HEARD = "powers were not heard: below sensitivity_db"
+FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
+SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
+
+
+def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
+    """Leave out rows without a value; censored ones hold the level that they lie below or above, masked.
+
+    Args:
+        check: of the file, whose `raw` is changed; takes notes, and what is wrong.
+        measured: name of the measurement.
+        links: of its rows; returned with `censored`, None where something is wrong.
+    """
+    values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
+    floor = _stated_floor(check, measured, values)
+    if len(check.problems) > before:
+        return None
+    arrays.pop("sensitivity_db", None)
+    mask = arrays.get("mask")
+    if mask is not None and (mask.shape != values.shape or mask.dtype.kind not in "biu"):
+        return links  # said where the mask is read
+    # A spectrum without power has no directions; where rows have paths they are a simulation's.
+    silent = measured == "spectrum" and not is_big(values) and "path_offsets" not in arrays
+    gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
+    if values.dtype.kind not in "iufc" or values.ndim == 0 or not (gaps or mask is not None or silent):
+        return links
+    axes = tuple(range(1, values.ndim))
+    unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
+    marked = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
+    censored = saturated = np.zeros(len(values), bool)
+    if measured == "rssi_db" and values.ndim == 1:
+        unheard = _without_marks(check, values, floor) & marked
+        heard = values[~unheard & np.isfinite(values)]
+        unknown |= unheard
+        if floor is not None:
+            censored = unknown & marked
+        elif unheard.any() and len(heard):
+            floor, censored = np.full(len(values), heard.min()), unheard
+        saturated = _saturated(check, values, ~unknown & marked)
+        values = arrays[measured]
+    if floor is not None:
+        _note_floor(check, links, values, floor, ~unknown & marked, censored)
+        if len(check.problems) > before:
+            return None
+        arrays[measured] = np.where(censored, floor, values)
+    lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
+    if mask is not None and lost.any():
+        return links  # marked as measured, and is not: refused where values are read
+    keep = marked & ~lost
+    if silent and values.any():
+        keep &= values.any(axis=axes)
+    # As `Measurements.censored`: 1 too weak, -1 too strong, 0 measured.
+    side = censored.astype(np.int8) - saturated
+    if not (keep & (side == 0)).any():
+        why = "nothing was heard in any row" if censored.any() else "nothing was measured"
+        return check.refuse(measured, f"{why}; expected numbers")
+    if not keep.all() or censored.any():
+        none = " or without any power" if measured == "spectrum" else ""
+        for flags, what in ((~keep, f"values are missing{none}"), (censored, NOT_HEARD)):
+            check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
+        arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
+        check.raw = replace(check.raw, arrays=arrays)
+    if not side.any():
+        return links
+    arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
+    return replace(links, censored=side)
+
+
+def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarray | None:
+    """The level (S,) [dB] below which the file says that nothing is heard; None without, or of no use."""
+    level = check.real("sensitivity_db", (), (1,), values.shape[:1])
+    saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
+    for name, said in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
+        if said and measured != "rssi_db":
+            return check.refuse(name, f"goes with rssi_db, not with {measured}")
+    if level is None or values.ndim != 1:
+        return None
+    floor = np.broadcast_to(level, values.shape)
+    floor = np.where(np.isnan(floor) & np.isfinite(values), values, floor)  # what was heard needs none
+    if not (np.abs(floor) <= 400).all():
+        return check.refuse("sensitivity_db", "expected dB between -400 and 400")
+    return floor
+
+
+def _note_floor(
+    check: Checker,
+    links: Links,
+    values: np.ndarray,
+    floor: np.ndarray,
+    known: np.ndarray,
+    censored: np.ndarray,
+) -> None:
+    """Refuse a level of hearing (S,) above known values (S,), note one far below them all."""
+    below = known & (values < floor)
+    # A value under the limit contradicts it: one of the two has another unit or receiver.
+    if below.any():
+        row = int(np.flatnonzero(below)[0])
+        of_row = replace(links, station=check.raw.arrays.get("station"))
+        named = of_row.named([*map(str, check.raw.arrays["row_name"])])[row]
+        wrong = f"{named}: rssi_db is {values[row]:.4g}, below {floor[row]:.4g}"
+        return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
+    highest, weakest = floor[censored].max(initial=-np.inf), values[known].min(initial=np.inf)
+    if FAR_BELOW_DB < weakest - highest < np.inf:
+        check.notes.append(
+            f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
+            "is it the receiver's? places where nothing was heard count as weaker still"
+        )
+    return None
+
+
+def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
+    """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
+    given = check.raw.attributes.get("not_heard")
+    marks = (
+        find_not_heard_marks(values)
+        if given is None
+        else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    )
+    # `not_heard=[]` keeps minus infinity as a level, too.
+    silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
+    floor = "sensitivity_db"
+    if level is None and silent.any() and np.isfinite(values[~silent]).any():
+        floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest"
+    for mark in marks if given is None else ():
+        share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
+        said = f"{share}, apart from all others: taken as not heard, below {floor}"
+        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit"
+        check.notes.append(Caution(f"{said}; {say}"))
+    return silent
+
+
+def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
+    given = check.raw.attributes.get("saturation_db", "auto")
+    SATURATION.check("dataset.saturation_db", given)
+    level = find_saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
+    if level is None:
+        return np.zeros(len(values), bool)
+    # Both in float32: a file's level may differ from the decimal setting by its rounding.
+    above = known & (values.astype(np.float32) >= np.float32(level))
+    said = f"{int(above.sum())} of {int(known.sum())} levels are"
+    if given == "auto":
+        said += f" exactly {level:.6g}, the most: a receiver in saturation? taken as at least that"
+        check.notes.append(Caution(f"{said}; dataset.saturation_db=none takes them as measured"))
+    else:
+        check.notes.append(f"{said} {level:g} dB or more: saturated, taken as at least that")
+    # Saturated rows hold the level itself: that bound is all that is known of them.
+    check.raw.arrays["rssi_db"] = np.where(above, level, values)
+    return above
