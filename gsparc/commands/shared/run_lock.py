@@ -34,7 +34,9 @@ class RunLock(Callback):
         folder = _folder(config, "hydra.run.dir")
         hold(folder)
         if config.hydra.output_subdir is not None:  # it writes there
-            set_aside(folder, SUMMARY)
+            # A log is appended to: of a new training it is a new one.
+            anew = "ckpt_path" in config and not config.ckpt_path
+            set_aside(folder, SUMMARY, *["*.log"] * anew)
 
     def on_multirun_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the multirun's folder, and with it those of its jobs."""

@@ -11,7 +11,8 @@ from doors import assert_refused, knock
 from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, hold, locked, release
+from gsparc.commands.shared import run_lock
+from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, RunLock, hold, locked, release
 from gsparc.commands.train import LEFT, train
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import read_run
@@ -130,6 +131,18 @@ def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path)
     given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path}"]
     assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "no such checkpoint")
     assert not (tmp_path / "summary.json").exists() and (tmp_path / "summary.json.earlier").exists()
+
+
+@pytest.mark.parametrize(("goes_on", "kept"), [(None, False), ("run", True)])
+def test_a_new_run_went_on_in_the_log_of_the_one_before(goes_on, kept, tmp_path, monkeypatch):
+    (tmp_path / "train.log").write_text("of the first run")
+    monkeypatch.setattr(run_lock, "_folder", lambda config, key: tmp_path)
+    config = OmegaConf.create({"ckpt_path": goes_on, "hydra": {"output_subdir": ".hydra"}})
+    try:
+        RunLock().on_run_start(config)
+    finally:
+        release()
+    assert (tmp_path / "train.log").exists() == kept
 
 
 def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
