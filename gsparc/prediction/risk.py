@@ -28,6 +28,7 @@ LEVELS = 50
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+CHANCE = 2.0  # paired standard errors that another confidence must gain to be chosen
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
@@ -315,11 +316,32 @@ def cells(position: np.ndarray) -> np.ndarray:
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
+def area_parts(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
+    """Return what each of n samples adds to the area under risk-coverage, (n,), whose mean is the area.
+
+    >>> score, loss = np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])
+    >>> bool(np.isclose(area_parts(score, loss).mean(), risk_coverage(score, loss).mean()))
+    True
+    """
+    # The sample at rank r is in the means of r, r + 1, ..., n samples; equal scores share their ranks.
+    weight = np.cumsum(1 / np.arange(len(score), 0, -1))[::-1]
+    order, group = np.argsort(-score, kind="stable"), np.unique(-score, return_inverse=True)[1]
+    shared = np.bincount(group[order], weight) / np.bincount(group)
+    return loss * shared[group]
+
+
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
-    """Return the confidence of the smallest area under risk-coverage on `rows`."""
+    """Return the confidence of the smallest area under risk-coverage on `rows`.
+
+    The first, mostly the model's own, stays where the gain is within `CHANCE` paired standard errors.
+    """
     # Bounded, so that a few fades do not decide which kind is the best.
     loss = bounded(evidence.error[rows])
-    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
+    parts = {kind: area_parts(score[rows], loss) for kind, score in evidence.scores.items()}
+    own, best = next(iter(parts)), min(parts, key=lambda kind: parts[kind].mean())
+    gain = parts[own] - parts[best]
+    # Both are of the same rows: their difference scatters less than either.
+    return best if gain.mean() > CHANCE * gain.std() / np.sqrt(max(len(gain), 1)) else own
 
 
 def accept(

@@ -57,6 +57,17 @@ def test_risk_of_the_surest(score, risk) -> None:
     assert np.allclose(risk_coverage(np.array(score), np.array([0.0, 0.9, 0.3])), risk)
 
 
+def test_auto_chose_another_confidence_by_chance() -> None:
+    """Of thirteen rows the least area is mostly luck: a gain within two paired standard errors is none."""
+    evidence = _evidence()
+    noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
+    alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
+    rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
+    assert {best_kind(replace(evidence, scores=alike), some) for some in rows} == {"learned"}
+    worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
+    assert best_kind(replace(evidence, scores=worse), np.arange(200)) == "expected"
+
+
 def test_knowing_the_errors_is_best() -> None:
     evidence = _evidence()
     loss = bounded(evidence.error)
