@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ from gsparc.evaluation.experiment.problem import named, problems_of
 from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, rows_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
+log = logging.getLogger(__name__)
+
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
@@ -49,6 +52,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
+    log.info("cells are in %s", cells_dir)
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
         filled = fill_all(prepared, run, bool(settings["train"]), limit_s)

@@ -24,6 +24,7 @@ class Contender:
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
+        networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
         only_longest: too slow for any but the longest budget.
     """
 
@@ -33,13 +34,15 @@ class Contender:
     kinds: tuple[str, ...] = ()
     stations: bool = False
     scene: bool = False
+    networks: bool = True
     only_longest: bool = False
 
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
         kind = not self.kinds or problem.kind in self.kinds
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
-        return kind and problem.stations >= self.stations and problem.scene >= self.scene
+        needs = problem.stations >= self.stations and problem.scene >= self.scene
+        return kind and needs and self.networks >= problem.network
 
     def overrides(self, budget_s: float | None) -> list[str]:
         """Overrides of train.yaml, but for the seed."""

@@ -20,6 +20,7 @@ from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment.done import content
+from gsparc.models.powers.together.network import network_of
 from gsparc.models.registry import complete
 from gsparc.simulate.scenes.build import names_scene
 
@@ -85,6 +86,13 @@ class Problem:
     def stations(self) -> bool:
         """Whether there are several, of which rows of each are learned from."""
         return self.data.site.stations is not None and self.folds.name != "stations"
+
+    @property
+    def network(self) -> bool:
+        """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
+        return (
+            self.kind == "rssi" and self.data.site.stations is not None and network_of(self.data) is not None
+        )
 
     @property
     def scene(self) -> bool:

@@ -19,7 +19,7 @@ BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
 
 
 def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
-    own = {"draw": None, "stations": False, "scene": False}
+    own = {"draw": None, "stations": False, "scene": False, "network": False}
     return SimpleNamespace(dataset=dataset, split=split, kind=kind, **(own | others))
 
 
@@ -77,6 +77,14 @@ def test_every_method_of_the_default_comparison_composes():
     for split in named("splits", SplitChoice, config["splits"]).values():
         assert set(split.datasets) <= set(config["datasets"])
         assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
+
+
+def test_one_model_of_a_network_was_fitted_under_four_names():
+    """Sectors are learned together whatever is asked for: `gsparc_together`, `gaussians`, `residual` say nothing."""
+    methods = named("methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"])
+    network = problem("city", kind="rssi", stations=True, network=True)
+    there = {cell.method for _, cell in plan([network], methods, [Budget(60, (0,))])}
+    assert "gsparc" in there and not there & {"gsparc_together", "gaussians", "residual"}
 
 
 @pytest.mark.parametrize(("group", "of", "entry", "message"), [
