@@ -44,7 +44,9 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     handles: dict[str, Artist] = {}
     # dict: each method once, though it is in many panels.
     for axis in grid.flat:
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+        # The line with its mark: an `errorbar` would be shown with bars that no point has.
+        lines, names = axis.get_legend_handles_labels()
+        handles |= {name: line[0] for name, line in zip(names, lines, strict=True)}
     figure.legend(
         list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
     )

@@ -74,6 +74,19 @@ def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, mon
     assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
 
 
+def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
+    """The legend drew every mark with an error bar, also of points without one."""
+    figures = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    draw_budgets(rows_of(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
+    (legend,) = figures[0].legends
+    marks = {
+        text.get_text(): line.get_marker()
+        for text, line in zip(legend.texts, legend.get_lines(), strict=True)
+    }
+    assert marks == {name: pictures.look(name).mark for name in ("gp", "gsparc", "gsrf")}
+
+
 def test_losers_are_not_hidden():
     said = " | ".join(remarks(blocks_of(rows_of(FOUND, TIMED))[0], "gsparc"))
     assert "first: gp" in said and "a simple baseline wins: take gp" in said
