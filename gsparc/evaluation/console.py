@@ -138,6 +138,7 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
     hint = suggest(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
+    hint = "; say hydra/launcher=joblib, too, or ray" if prefix == "hydra.launcher" else hint
     return f"{full}: no such setting{hint}"
 
 

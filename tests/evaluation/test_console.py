@@ -26,6 +26,12 @@ def test_an_error_is_one_line(error, line):
     assert one_line(error) == line
 
 
+def test_a_setting_of_a_launcher_that_was_not_chosen_had_no_hint():
+    with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
+        compose("train", overrides=["hydra.launcher.n_jobs=2"])
+    assert one_line(error.value).endswith("say hydra/launcher=joblib, too, or ray")
+
+
 def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
     """A default run of a city filled five screens: notes of each station, sixty warnings of a kind."""
     screen = Screen(["gsparc.models"], io.StringIO())
