@@ -309,6 +309,8 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
 def _of_fits(fits: Outcome) -> dict[str, Any]:
     cpu_s = statistics.fmean(fits.train_cpu_s)
     facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
+    said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
+    facts["model/learned"] = "\n".join(said) or None
     if fits.cost.stages:
         facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
     return facts

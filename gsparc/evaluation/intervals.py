@@ -1,4 +1,4 @@
-"""How honest predicted variances of powers are: intervals that hold the truth, outages that come true."""
+"""How honest predicted variances are: errors over deviations, intervals that hold the truth, outages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from scipy.stats import norm
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import in_decibels
+from gsparc.evaluation.metric_formats import CALIBRATION
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
@@ -18,7 +19,7 @@ SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """Figures of predicted normal distributions of decibels; empty where the method has no variance.
 
-    `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
+    `reduced_chi2` is as in `reduced_chi_squared`, of decibels; `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
     `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
     of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
     perfect, and `outage/brier_rate` what always saying the rate gives.
@@ -37,8 +38,10 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     if heard.any():
         # z of .95 is 1.645 for the central 90 % of a normal distribution.
         half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
-        inside = np.abs(10 * np.log10(power[heard]) - mean_db[heard]) <= half
-        figures |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
+        error = np.abs(10 * np.log10(power[heard]) - mean_db[heard])
+        figures |= {"interval/coverage_90": float((error <= half).mean())}
+        figures |= {"interval/width_db": float(2 * half.mean())}
+        figures |= {CALIBRATION: float(np.mean((error / spread_db[heard]) ** 2))}
     level_db = levels(data)
     if level_db is None:
         return figures
@@ -54,6 +57,18 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         # Brier 1950; saying the rate r each time gives its variance, r (1 - r).
         "outage/brier_rate": rate * (1 - rate),
     }
+
+
+def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float | None]:
+    """Return the mean squared error over its predicted variance; empty where the method has no variance.
+
+    1 where `Predictor.std` is right on average, above where it is too small, below where it is too large.
+    """
+    variance = scores.variance * data.site.target_scale**2
+    known = np.isfinite(scores.samples["mse"]) & (variance > 0)
+    if not known.any():
+        return {}
+    return {CALIBRATION: float(np.mean(scores.samples["mse"][known] / variance[known]))}
 
 
 def levels(data: Measurements) -> np.ndarray | None:
@@ -92,11 +107,13 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
 
 
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies; of powers also `with_silent`, `power_intervals` and, of stations held out, errors left
+    """Accuracies and `reduced_chi_squared`; of powers also `with_silent`, `power_intervals` and, of stations held out, errors left
     after a constant of each.
     """
     figures = scores.figures()
-    if data.site.kind == "rssi":
+    if data.site.kind != "rssi":
+        figures |= reduced_chi_squared(scores, data)
+    else:
         figures |= with_silent(scores, data) | power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
             figures["rmse_db_after_constant"] = scores.after_constant(data.station)

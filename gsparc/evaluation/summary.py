@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import platform
+import re
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -19,13 +20,14 @@ import numpy as np
 from rich.table import Table
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
+from gsparc.evaluation.metric_formats import CALIBRATION, DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 WITH_SILENT = "rmse_db_with_silent"
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 TRAIN_S = "train s/fold"  # head of every table: the mean over folds, each of which trains a model
+MOST_LEARNED = 3  # notes of a fit below the table; the log has all
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -101,8 +103,9 @@ def result_rows(
         method: name of the row with `facts[prefix/...]`.
         prefix: `test`, `train` or `val`.
     """
-    silent = [WITH_SILENT] if f"{prefix}/{WITH_SILENT}" in facts else []
-    wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], *silent, "skill")]
+    # Silent rows, and variances, are not of all data and methods.
+    beside = [name for name in (WITH_SILENT, CALIBRATION) if f"{prefix}/{name}" in facts]
+    wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], "skill", *beside)]
     names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
     names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
     rows, own = [], [(method, prefix, "time")]
@@ -150,9 +153,17 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
-    if facts.get("model/made") not in (None, facts.get("model/label")):
-        cost.insert(0, f"{facts['model/label']}: {facts['model/made']}")
-    return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
+    return [*seen.get(prefix, []), *run_conditions(facts), *rest, *chosen_model(facts), *cost]
+
+
+def chosen_model(facts: Mapping[str, Any]) -> list[str]:
+    """Return which method was chosen and what it is made of, then what it learned, of a law or of beams."""
+    made, label = facts.get("model/made"), facts.get("model/label")
+    # `ImageSources` is said as image sources.
+    kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
+    named = [] if made in (None, label) else [made if made.startswith(kind) else f"{kind}: {made}"]
+    learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
+    return [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from gsparc.evaluation.summary import (
     program_version,
     provenance,
     remarks,
+    result_rows,
     results_table,
     write_samples,
     write_summary,
@@ -66,6 +67,10 @@ def test_table_shows_no_accuracy_without_its_time():
     assert [row[0] for row in cells] == ["zero", "gp", "gsparc"]
     assert cells[2] == ["gsparc", "30.00", "-", "0.9123", "-", "-", "123", "1.25"]
     assert cells[1][-2:] == ["0.5", "2.5"]
+    heads, rows = result_rows(
+        {**facts, "test/reduced_chi2": 1.061, "baseline/gp/reduced_chi2": 3.0}, "gsparc"
+    )
+    assert dict(zip(heads, rows[-1], strict=True))["reduced_chi2"] == "1.06" and "3.00" in rows[1]
 
 
 def test_commit_is_known_inside_the_tree_only(tmp_path):
@@ -104,6 +109,17 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     quiet["baseline/gp/psnr_db"] = 29.0
     assert remarks(quiet) == []
     assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]
+
+
+@pytest.mark.parametrize(("kind", "made", "learned", "said"), [
+    ("ImageSources", "rays in closed form", None, ["gsparc: image sources: rays in closed form"]),
+    ("ArrayProcess", "array process through 9 Gaussians", None, ["gsparc: array process through 9 Gaussians"]),
+    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
+     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c"]),
+])  # fmt: skip
+def test_the_console_never_said_which_method_was_chosen(kind, made, learned, said):
+    facts = {"dataset/kind": "csi", "model/label": "gsparc", "model/class": kind, "model/made": made}
+    assert remarks({**facts, "model/learned": learned}) == said
 
 
 @pytest.mark.parametrize("prefix", ["train", "val"])

@@ -13,6 +13,7 @@ import pandas as pd
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
+from gsparc.evaluation.metric_formats import CALIBRATION, form_of, heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, TRAIN_S, markdown_table, shown
 
@@ -27,6 +28,7 @@ SCORE = {
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, by their columns
     "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
+    "chi2": CALIBRATION,
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
@@ -35,7 +37,7 @@ GROUP = [*PROBLEM, "budget_s", "method"]
 CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
-    "behind_error_db", "coverage", "outage", "after_constant", "second", "second_value", "train_s",
+    "behind_error_db", *BESIDE, "second", "second_value", "train_s",
     "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
 ]  # fmt: skip
 
@@ -55,7 +57,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
         return pd.DataFrame(columns=CELL)
     # pandas would make 1.0 of 1 where another row has None.
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
-    numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
+    numbers = ["budget_s", "load", *BESIDE, "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
@@ -75,7 +77,8 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
         `behind_db`: how much the problem's best has more, mean of the same draws, and its standard error.
         `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
-        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB].
+        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB]; `chi2`: of
+        `reduced_chi_squared`.
         `train_s`, `train_cpu_s`: seconds of training per model, on the clock and of the processor.
         `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same rounds.
         `load`: 1-minute load per core at the end of the training.
@@ -87,10 +90,7 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
     cells["behind_db"] = _behind(cells)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    means = [
-        "score_db", "value", "behind_db", "coverage", "outage", "after_constant", "second_value", "train_s",
-        "train_cpu_s", "load",
-    ]  # fmt: skip
+    means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
     rows[["figure", "second"]] = groups[["figure", "second"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
@@ -226,7 +226,7 @@ def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
     columns[block.second.iloc[0]] = column("second_value", ".4g")
     for name, head, form in (
         ("after_constant", "after a constant, dB", ".2f"), ("coverage", "in 90 % interval", ".2f"),
-        ("outage", "outage, Brier score", ".4f"),
+        ("outage", "outage, Brier score", ".4f"), ("chi2", heading_of(CALIBRATION), form_of(CALIBRATION)),
     ):  # fmt: skip
         if block[name].notna().any():
             columns[head] = column(name, form)

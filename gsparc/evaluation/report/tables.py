@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of
+from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, form_of, heading_of
 from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.report.table import Column, Table, interval, over_seeds
 from gsparc.evaluation.summary import TRAIN_S
@@ -39,6 +39,7 @@ def results(runs: Sequence[Run]) -> Table:
     columns = [
         SETTING, SEED,
         *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].row["kind"]]),
+        Column(heading_of(CALIBRATION), form_of(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
