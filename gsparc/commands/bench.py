@@ -9,11 +9,14 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish, run_directory
-from gsparc.evaluation.summary import shown, table, write_samples
+from gsparc.evaluation.table import Column, Table
 from gsparc.prediction.bench import Call, cases, loss, step
 from gsparc.prediction.timing import ClockSettings, interleaved
 
-HEADS = ("kernel", "size", "seconds", "in torch", "times faster")
+COLUMNS = (
+    Column("kernel", ""), Column("size", ""), Column("seconds", ".3g"), Column("in torch", ".3g"),
+    Column("times faster", ".3g"),
+)  # fmt: skip
 # A dense reference may take seconds: after half a second no new round begins.
 REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
 
@@ -29,11 +32,11 @@ def task(config: DictConfig) -> dict[str, Any]:
         seconds = median_s(case.kernel, clock)
         reference = None if case.reference is None else median_s(case.reference, REFERENCE)
         ratio = None if reference is None else reference / seconds
-        rows.append([name, size, *(shown(value, ".3g") for value in (seconds, reference, ratio))])
+        rows.append([name, size, seconds, reference, ratio])
         facts[f"bench/{name}/{size}/seconds"] = seconds
-    write_samples(run_directory() / "bench.csv", dict(zip(HEADS, zip(*rows, strict=True), strict=True)))
-    sheet = table("", HEADS[:2], HEADS[2:], rows)
-    sheet.caption = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
+    note = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
+    sheet = Table("", COLUMNS, rows, note)
+    (run_directory() / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
     return finish(run_directory(), facts, sheet)
 
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.open_runs import collect, store
 from gsparc.evaluation.pictures import NAMES, draw_calibration
-from gsparc.evaluation.summary import provenance, shown, table, write_summary
+from gsparc.evaluation.results import under
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.table import Column, Interval, Table
 from gsparc.prediction.risk import Guarantee, figures, too_few, trials
 from gsparc.prediction.timing import machine_facts
 
@@ -61,31 +63,28 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def tables(facts: dict[str, Any]) -> list[Table]:
     """Return tables of confidences side by side, and of bounds beside what came of them."""
-    wanted = {
-        "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
-        "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),
-    }  # fmt: skip
     curves = [
-        [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
-        for kind in NAMES
-        if f"confidence/{kind}/area" in facts
-    ]
-    draws = []
-    for how in ("random", "spatial"):
-        # Spatial draws were left out where the patches were too few.
-        if f"trial/{how}/kind" not in facts:
-            continue
-        own = {key.rpartition("/")[2]: value for key, value in facts.items() if f"trial/{how}/" in key}
-        ends = f"{own['broken_low'] or 0:.0%} to {own['broken_high'] or 0:.0%}"
-        broken = "-" if own["broken"] is None else f"{own['broken']:.1%}, {ends}"
-        draws.append([
-            how, own["kind"], f"{own['coverage']:.0%}", shown(own["realised"], ".1%"), broken,
-            f"{own['broken_of_all']:.1%}", f"{facts['promise/delta']:.0%}", f"{own['silent']:.0%}",
-        ])  # fmt: skip
-    numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
+        Column("confidence", "", of="kind"), Column("area under risk-coverage", of="area"),
+        Column("below distance", ".0%", of="area_below_distance"),
+        Column("risk at 70 %", of="risk_at_70"), Column("rank", ".2f", of="rank_correlation"),
+    ]  # fmt: skip
+    kinds = [{"kind": kind, **under(facts, f"confidence/{kind}")} for kind in NAMES]
+    draws = [
+        Column("split", "", of="how"), Column("confidence", "", of="kind"),
+        Column("accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
+        Column("broken", ".1%", of=_broken), Column("of all draws", ".1%", of="broken_of_all"),
+        Column("promised", ".0%", of=lambda row: facts["promise/delta"]),
+        Column("accepted nobody", ".0%", of="silent"),
+    ]  # fmt: skip
+    # Spatial draws are left out where the patches are too few.
+    trials_of = [{"how": how, **under(facts, f"trial/{how}")} for how in ("random", "spatial")]
     heading = f"{facts['dataset/name']}: {facts['positions']} positions of {facts['model/name']}"
     promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
     return [
-        table(heading, ["confidence"], list(wanted), curves),
-        table(promise, ["split", "confidence"], numbers, draws),
+        Table.of(heading, curves, [row for row in kinds if "area" in row]),
+        Table.of(promise, draws, [row for row in trials_of if "coverage" in row]),
     ]
+
+
+def _broken(row: Mapping[str, Any]) -> Interval | None:
+    return None if row["broken"] is None else Interval(row["broken"], row["broken_low"], row["broken_high"])

@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 from omegaconf import DictConfig
-from rich.markdown import Markdown
 
 from gsparc.commands.shared.output import run_directory, show
 from gsparc.commands.shared.run_lock import locked
@@ -25,7 +24,7 @@ from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, pre
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import named, problems_of
-from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, rows_of
+from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, remarks, rows_of, table_of
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
@@ -87,10 +86,9 @@ def report(
     blocks = blocks_of(rows)
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
-    page = markdown(blocks, ours)
     write_samples(run_dir / "compare.csv", rows.to_dict("list"))
     write_samples(run_dir / "cells.csv", cells_of(filled)[CELL].to_dict("list"))
-    (run_dir / "compare.md").write_text(page, encoding="utf-8")
+    (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
     for here in by_set:
         draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
     if not rows.draws.all():
@@ -107,5 +105,6 @@ def report(
             own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": query_ms}
             facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}
     write_summary(run_dir / "summary.json", facts)
-    show(run_dir, Markdown(page))
+    shown: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]
+    show(run_dir, *shown)
     return rows

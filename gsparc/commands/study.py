@@ -13,7 +13,6 @@ from typing import Any
 import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from rich.table import Table
 
 from gsparc.commands.shared.output import finish, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
@@ -22,8 +21,9 @@ from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, content
 from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Study, facts_of
-from gsparc.evaluation.summary import TRAIN_S, run_conditions, shown, table, write_samples
+from gsparc.evaluation.experiment.study import Condition, Study, facts_of
+from gsparc.evaluation.summary import run_conditions, write_samples
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, estimate
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
@@ -79,16 +79,9 @@ def task(config: DictConfig) -> pd.DataFrame:
 
 def table_of(rows: pd.DataFrame, title: str) -> Table:
     """Return a table with a line per row; conditions where the study has any."""
-    changed = (rows.what != "none").any()
-    costs = {
-        "train_s": TRAIN_S, "train_cpu_s": "cpu s/fold", "query_ms": "query ms", "query_p95_ms": "p95"
-    }  # fmt: skip
-    lines = []
-    for row in rows.to_dict("records"):
-        change = row["what"] if row["what"] == "none" else f"{row['what']} {row['amount']:g}"
-        value = f"{row['value']:.4g}" + ("" if pd.isna(row["spread"]) else f" ± {row['spread']:.2g}")
-        words = [row["variant"], row["effects"], *([change] if changed else [])]
-        lines.append([*words, f"{row['rows']:g}", value, *(shown(row[name], ".3g") for name in costs)])
-    words = ["variant", "effects", *(["changed"] if changed else [])]
-    numbers = ["rows", rows.figure.iloc[0], *costs.values()]
-    return table(title, words, numbers, lines)
+    changed = [Column("changed", "", of=lambda row: str(Condition(row["what"], row["amount"])))]
+    words = [Column("variant", "", of="variant"), Column("effects", "", of="effects")]
+    words += changed if (rows.what != "none").any() else []
+    value = Column(rows.figure.iloc[0], of=estimate("value", "spread"))
+    columns = [*words, Column("rows", "g", of="rows"), value, TRAIN, CPU, P50, P95]
+    return Table.of(title, columns, rows.to_dict("records"))  # type: ignore[arg-type]

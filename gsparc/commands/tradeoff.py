@@ -23,7 +23,8 @@ from gsparc.evaluation.experiment.done import State, content, once
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
-from gsparc.evaluation.summary import table, write_samples
+from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.table import Column, Table
 from gsparc.models.pareto import front
 from gsparc.models.reduced import combinations, reduced
 from gsparc.prediction import operating_point
@@ -88,11 +89,11 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         "time/includes": "one query end to end: world position in, physical units out; warm",
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
-    heads, lines = tradeoff.cells_of(best, figure)
+    front_rows = table_of_points[table_of_points.front == 1].to_dict("records")
+    sheet = Table.of(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
     with tracking.opened(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
-        tracking.log_table(loggers, "operating points", heads, lines)
-    sheet = table(title, ["not beaten"], heads[1:], lines)
+        tracking.log_table(loggers, "operating points", *sheet.texts())
     finish(run_dir, facts, sheet, lines=tradeoff.irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.
     for p in best:

@@ -332,8 +332,8 @@ def _draw(
         title = f"{data.site.name}: test rows of {method.label}"
         draw_predictions(method, data, fold, title, run_dir / "test.png")
         tracking.log_picture(loggers, "test rows", run_dir / "test.png")
-    table = summary.result_rows(facts, str(facts["model/label"]), config.eval_on)
-    tracking.log_table(loggers, "results", *table)
+    table = summary.results_table(facts, str(facts["model/label"]), prefix=config.eval_on)
+    tracking.log_table(loggers, "results", *table.texts())
     found = method.objects()
     if len(found):
         draw_found(data, found, run_dir / "found.png", _known_walls(config))

@@ -19,7 +19,8 @@ SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """Figures of predicted normal distributions of decibels; empty where the method has no variance.
 
-    `reduced_chi2` is as in `reduced_chi_squared`, of decibels; `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
+    `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
+    `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
     `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
     of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
     perfect, and `outage/brier_rate` what always saying the rate gives.
@@ -107,8 +108,8 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
 
 
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies and `reduced_chi_squared`; of powers also `with_silent`, `power_intervals` and, of stations held out, errors left
-    after a constant of each.
+    """Accuracies and `reduced_chi_squared`; of powers also `with_silent`, `power_intervals` and, of stations
+    held out, errors left after a constant of each.
     """
     figures = scores.figures()
     if data.site.kind != "rssi":

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
-from gsparc.evaluation.summary import table
+from gsparc.evaluation.table import Table
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import shipped
@@ -78,4 +77,4 @@ def shipped_scenes() -> Table:
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(tracer.triangles()):,}", used])
     heads = ["scene", "size [m]", "triangles", "materials"]
-    return table("scene=NAME: scenes that come with Sionna", heads, [], rows)
+    return Table.of_texts("scene=NAME: scenes that come with Sionna", heads, [], rows)

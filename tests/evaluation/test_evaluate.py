@@ -10,7 +10,7 @@ from gsparc.data.own import from_arrays
 from gsparc.evaluation.baselines import BASELINES, baseline
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.scores import score
-from gsparc.evaluation.summary import decided_by_a_row, result_rows, write_samples, write_summary
+from gsparc.evaluation.summary import decided_by_a_row, results_table, write_samples, write_summary
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.method import Method, Prediction
@@ -77,9 +77,9 @@ def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monke
     facts = evaluate(methods, seconds, data, split, clock=QUICK, baselines=names, shared="idw").facts
     assert facts["baseline/idw/rmse_db"] == facts["test/rmse_db"]
     assert facts["baseline/idw/train_s"] == facts["time/train_s"]
-    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw"]
+    assert [row[0] for row in results_table(facts, "idw").rows] == ["mean", "idw"]
     facts["baseline/idw/rmse_db"] += 1  # fitted otherwise, a row of its own
-    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw (baseline)", "idw"]
+    assert [row[0] for row in results_table(facts, "idw").rows] == ["mean", "idw (baseline)", "idw"]
 
 
 def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
@@ -91,7 +91,7 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     squares = [facts[f"{one}/rmse_db"] ** 2 for one in ("test", "baseline/nearest")]
     assert facts["test/skill"] == pytest.approx(1 - squares[0] / squares[1])
     assert not any("decided_by" in key for key in facts) and not decided_by_a_row(facts)
-    heads, _ = result_rows(facts, "idw")
+    heads, _ = results_table(facts, "idw").texts()
     assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.apps.locate import locator as locating
 from gsparc.apps.locate.cells import Cells, cover
@@ -29,7 +28,8 @@ from gsparc.evaluation.console import plain
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, aligned, open_files
 from gsparc.evaluation.scores import rows_of
-from gsparc.evaluation.summary import table, write_samples
+from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.table import Table
 from gsparc.prediction.predictor import keep
 
 log = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ def report(
         facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
-    shown = [table(title, ["method"], ["median [m]", "p90 [m]"], rows)]
+    shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
     if result.inside is None:
         return facts, shown, []

@@ -22,6 +22,7 @@ from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import rows_of, score
+from gsparc.evaluation.table import Column
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Point, Settings, worded
 from gsparc.models.per_station import PerStation
@@ -31,6 +32,10 @@ from gsparc.prediction.timing import Call, ClockSettings, interleaved
 
 log = logging.getLogger(__name__)
 
+POINT = (  # columns of the table of points
+    Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
+    Column("ms p95", ".3g", of="render_ms_p95"),
+)  # fmt: skip
 CLOSEST_DB = 100.0  # the precision of float32
 
 
@@ -218,12 +223,6 @@ def facts_of(
     for name, other in others.items():
         facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
     return facts
-
-
-def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
-    """Heads and rows of the table of points."""
-    rows = [[p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}"] for p in best]
-    return ["point", "ms p50", "ms p95", figure], rows
 
 
 def irreducible(method: Method) -> list[str]:

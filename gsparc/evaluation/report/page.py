@@ -18,9 +18,9 @@ from PIL import Image
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
-from gsparc.evaluation.report.table import Table
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
+from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
 PICTURE_PX = 1000  # width at which pictures are kept

@@ -18,8 +18,7 @@ from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.table import interval
-from gsparc.evaluation.report.tables import grouped
+from gsparc.evaluation.report.tables import grouped, interval
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8

@@ -12,7 +12,6 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.markdown import Markdown
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
@@ -85,7 +84,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
         plots.distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
-        console.print(Markdown(table.without(*WIDE).markdown()))
+        console.print(table.without(*WIDE))
         for row in table.rows:
             for column, value in zip(table.columns[1:], row[1:], strict=True):
                 facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)

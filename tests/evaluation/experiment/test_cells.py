@@ -80,7 +80,7 @@ def test_every_method_of_the_default_comparison_composes():
 
 
 def test_one_model_of_a_network_was_fitted_under_four_names():
-    """Sectors are learned together whatever is asked for: `gsparc_together`, `gaussians`, `residual` say nothing."""
+    """Sectors are learned together whatever `gsparc_together`, `gaussians`, `residual` ask for."""
     methods = named("methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"])
     network = problem("city", kind="rssi", stations=True, network=True)
     there = {cell.method for _, cell in plan([network], methods, [Budget(60, (0,))])}

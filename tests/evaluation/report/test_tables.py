@@ -10,7 +10,8 @@ import pytest
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.plots import short
 from gsparc.evaluation.report.runs import Run, distinct_overrides, find_runs, read_columns
-from gsparc.evaluation.report.table import Column, Interval, Table, bootstrap, interval
+from gsparc.evaluation.report.tables import bootstrap, interval
+from gsparc.evaluation.table import Column, Interval, Table
 
 
 def cells(table, row: int) -> dict:
@@ -92,7 +93,7 @@ def test_a_table_survives_csv_and_markdown():
     assert rows[0] == {"name": "a|b", "x": "1.25", "x low": "1.0", "x high": "2.0", "n": "3"}
     assert rows[1]["x"] == ""
     text = table.markdown()
-    assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | – | – |" in text and "note" in text
+    assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | - | - |" in text and "note" in text
 
 
 def test_columns_keep_text_as_text(tmp_path):
