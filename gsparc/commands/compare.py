@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -24,7 +23,16 @@ from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, pre
 from gsparc.evaluation.experiment.latency import Latency, timed_here
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import named, problems_of
-from gsparc.evaluation.experiment.table import CELL, blocks_of, cells_of, markdown, remarks, rows_of, table_of
+from gsparc.evaluation.experiment.table import (
+    CELL,
+    blocks_of,
+    cells_of,
+    markdown,
+    remarks,
+    rows_of,
+    table_of,
+    title_of,
+)
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
@@ -93,18 +101,8 @@ def report(
         draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
     if not rows.draws.all():
         draw_budgets(rows[~rows.draws], run_dir / "compare.png", ours, figures)
-    facts: dict[str, Any] = {"cells": len(filled), **provenance()}
-    for block in blocks:
-        budget = block.budget_s.max()
-        name = "any" if math.isnan(budget) else f"{budget:g}"
-        stem = f"{block.dataset.iloc[0]}/{block.split.iloc[0]}/{name}"
-        facts[f"{stem}/first"] = block.method.iloc[0]
-        for row in block.itertuples():
-            # JSON has no NaN: a method whose queries were not timed has null.
-            query_ms = None if math.isnan(row.query_ms) else row.query_ms
-            own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": query_ms}
-            facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}
-    write_summary(run_dir / "summary.json", facts)
+    best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
+    write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})
     shown: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]
     show(run_dir, *shown)
     return rows

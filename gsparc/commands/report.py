@@ -35,11 +35,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program_version(origin)}"
     write(out, config.title, note, sections, config.figures)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
-    for run in runs:
-        stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
-        own = {"train_s": "train_s", "render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms"}
-        own[run.row["figure"]] = "value"
-        facts |= {f"{stem}/{name}": run.row[column] for name, column in own.items()}
     write_summary(out / "summary.json", facts)
     console = open_console()
     console.print(f"{note}; written to {out / 'report.html'}", highlight=False)

@@ -1,7 +1,6 @@
 """`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
 
-Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
-accuracy under its own name, seconds of training and milliseconds of a query.
+Leaves `study.csv`, a row a variant and condition (`study.ROW`), `study.png` and `summary.json`.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, content
 from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Condition, Study, facts_of
+from gsparc.evaluation.experiment.study import Condition, Study
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, estimate
 from gsparc.models.method import MethodFactory
@@ -68,7 +67,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         raise KeyboardInterrupt(message) from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": study.rounds, **facts_of(rows),
+        "seed": settings.seed, "study/rounds": study.rounds,
     }  # fmt: skip
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))

@@ -50,7 +50,7 @@ def swept(field, tmp_path_factory):
 def test_dashboards_get_the_points_that_nothing_beats(swept):
     facts, _, _, said = swept
     ((loggers, name, heads, rows),) = said
-    assert (loggers, name, heads[:2]) == (1, "operating points", ["point", "ms p50"])
+    assert (loggers, name, heads[:2]) == (1, "operating points", ["not beaten", "ms p50"])
     assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
 
 

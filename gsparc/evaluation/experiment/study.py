@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -93,20 +93,6 @@ ROW = (
     "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
     "query_ms", "query_p95_ms",
 )  # fmt: skip
-NAMES = ("variant", "what", "amount", "figure", "value", "spread")
-
-
-def facts_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return figures as `study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, s, ms."""
-    facts: dict[str, Any] = {}
-    for row in rows.to_dict("records"):
-        stem = f"study/{row['variant']}" + (
-            "" if row["what"] == "none" else f"/{row['what']}/{row['amount']:g}"
-        )
-        own = {row["figure"]: row["value"], f"{row['figure']}_spread": row["spread"]}
-        own |= {name: value for name, value in row.items() if name not in NAMES}
-        facts |= {f"{stem}/{name}": value for name, value in own.items() if pd.notna(value)}
-    return facts
 
 
 @dataclass(frozen=True)
@@ -240,64 +226,34 @@ def _value(outcome: Outcome, figure: str) -> float:
 
 
 @dataclass(frozen=True)
-class Effects:
-    """What each effect costs, and what it gains: the data stay as they are."""
-
-    title: ClassVar[str] = "what effects cost and gain"
-
-    def conditions(self) -> list[Condition]:
-        """Return the data as they are."""
-        return [Condition()]
-
-
-@dataclass(frozen=True)
-class Positions:
-    """What errors of positions and of directions of arrival cost.
+class Kind:
+    """What a study changes about the data, one thing at a time; nothing: the variants alone are compared.
 
     Attributes:
-        errors_m: standard deviations of each coordinate [m].
+        title: of its table and figure.
+        errors_m: standard deviations of each coordinate of places [m].
         errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
         train_errors: whether training positions are disturbed, too; else those of queries alone.
-    """
-
-    title: ClassVar[str] = "accuracy against errors of positions and directions"
-    errors_m: Sequence[float] = ()
-    errors_deg: Sequence[float] = ()
-    train_errors: bool = True
-
-    def conditions(self) -> list[Condition]:
-        """Return no error, then of a `query`, in training (`train_known`: of known size), of `directions`."""
-        errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
-        return [
-            Condition(),
-            *(
-                Condition(what, error)
-                for what in ("query", *(("train", "train_known") if self.train_errors else ()))
-                for error in errors
-            ),
-            *(Condition("directions", error) for error in degrees),
-        ]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Accuracy against the number of measurements.
-
-    Attributes:
         keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones are
             subsets of larger ones. Validation rows are thinned with them, test rows stay.
     """
 
-    title: ClassVar[str] = "accuracy against the number of measurements"
-    keep: Sequence[float] = (1.0,)
+    title: str
+    errors_m: Sequence[float] = ()
+    errors_deg: Sequence[float] = ()
+    train_errors: bool = True
+    keep: Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        if not self.keep or not all(float(keep) > 0 for keep in self.keep):
+        if not all(float(keep) > 0 for keep in self.keep):
             raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
 
     def conditions(self) -> list[Condition]:
-        """Return a condition per training set, called `keep`."""
-        return [Condition("keep", float(keep)) for keep in self.keep]
+        """Return the data as they are, but where rows are thinned, then every change by every amount."""
+        placed = ("query", *(("train", "train_known") if self.train_errors else ()))
+        amounts = {**dict.fromkeys(placed, self.errors_m), "directions": self.errors_deg, "keep": self.keep}
+        changed = [Condition(what, float(amount)) for what, every in amounts.items() for amount in every]
+        return changed if self.keep else [Condition(), *changed]
 
 
 def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:

@@ -76,7 +76,6 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
         runs = retime(runs, rounds=settings.rounds, budget_s=settings.budget_s)
     origin = summary.provenance()
     write(folder, title, f"{len(runs)} runs; made by {summary.program_version(origin)}", studies(runs))
-    facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
     for number, (study, together) in enumerate(by_study(runs).items()):
         group = distinct_overrides(together)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
@@ -85,8 +84,5 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
         (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
         plots.distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
         console.print(table.without(*WIDE))
-        for row in table.rows:
-            for column, value in zip(table.columns[1:], row[1:], strict=True):
-                facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)
-    summary.write_summary(folder / "summary.json", facts)
+    summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
     console.print(f"written to {folder}", highlight=False)
