@@ -26,6 +26,15 @@ def test_an_error_is_one_line(error, line):
     assert one_line(error) == line
 
 
+def test_evaluate_said_how_every_column_is_read():
+    """28 lines of columns, of the file and of the one that was learned from, stood before its table."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        node = compose("evaluate", overrides=["ckpt=x"], return_hydra_config=True).hydra.job_logging
+    screen = Screen(node.handlers.console.quiet, io.StringIO())
+    said = [logging.LogRecord("gsparc.data.datasets.own", level, "", 0, "x", (), None) for level in (20, 30)]
+    assert [screen.filter(one) for one in said] == [False, True]
+
+
 def test_a_setting_of_a_launcher_that_was_not_chosen_had_no_hint():
     with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
         compose("train", overrides=["hydra.launcher.n_jobs=2"])

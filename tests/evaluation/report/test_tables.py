@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.plots import short
@@ -114,6 +115,15 @@ def test_labels_keep_the_value_that_tells_settings_apart():
     said = [short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
     assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
     assert short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and short("gp") == "gp"
+
+
+def test_labels_of_sweeps_lost_true_and_false_on_the_console():
+    settings = [f"gsparc-paper model.attenuation.inverse_distance={on}" for on in (True, False)]
+    columns = [Column("method and setting", ""), *(Column(f"figure {n} dB") for n in range(8))]
+    console = Console(width=100, record=True, file=io.StringIO(), soft_wrap=True)
+    console.print(Table("", columns, [[one, *[Interval(1.0, 0.5, 1.5)] * 8] for one in settings]))
+    first = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines() if "│" in line)
+    assert all(one.replace(" ", "") in first.replace(" ", "") for one in settings)
 
 
 def test_settings_of_several_models_were_told_for_each(tmp_path):
