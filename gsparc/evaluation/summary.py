@@ -120,7 +120,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
-    return [*seen.get(prefix, []), *run_conditions(facts), *rest, *chosen_model(facts), *cost]
+    lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *chosen_model(facts), *cost]
+    # The candidate's name, as stored summaries have it, is no word for users.
+    return [line.replace("joint_powers", "powers of all stations") for line in lines]
 
 
 def chosen_model(facts: Mapping[str, Any]) -> list[str]:
@@ -128,7 +130,7 @@ def chosen_model(facts: Mapping[str, Any]) -> list[str]:
     made, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
-    named = [] if made in (None, label) else [made if made.startswith(kind) else f"{kind}: {made}"]
+    named = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
     learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
     return [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
 

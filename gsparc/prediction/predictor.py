@@ -170,6 +170,7 @@ class Predictor(InDegrees, Jointly, Judging):
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry, in the unit of the answers and float32.
 
+        Far from all data it is that of knowing nothing: about 1 of spectra, whose pixels are from 0 to 1.
         Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1) of other kinds.
 
         >>> predictor.std(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]]).shape  # [dB]

@@ -112,6 +112,7 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
 @pytest.mark.parametrize(("kind", "made", "learned", "said"), [
     ("ImageSources", "rays in closed form", None, ["gsparc: image sources: rays in closed form"]),
     ("ArrayProcess", "array process through 9", None, ["gsparc: array process through 9"]),
+    ("Powers", "joint_powers in closed form", None, ["gsparc: powers of all stations in closed form"]),
     ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
      ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c"]),
 ])  # fmt: skip
