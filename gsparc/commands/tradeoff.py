@@ -25,11 +25,11 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.pareto import front
+from gsparc.models.pareto import Point, front
 from gsparc.models.reduced import combinations, reduced
 from gsparc.prediction import operating_point
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, percentiles, reference_copy
+from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, reference_copy
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     others = tradeoff.others_of(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
-    clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
+    clocks = {name: Predictor(one.methods[0], data.site).cycling(places) for name, one in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
@@ -72,9 +72,8 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     if config.store:
         operating_point.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
-        name: tradeoff.Other(value, *percentiles(other_ms[name]))
-        for name, (_, value) in others.items()
-        if value is not None
+        name: Point(name, {}, 1, one.scores.figures(), np.nan, other_ms[name], 0)
+        for name, one in others.items()
     }
     copy_ms = float(np.median(other_ms[COPY]))
     table_of_points = tradeoff.table_of(points, pareto, chosen, copy_ms)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baselines import baseline
+from gsparc.evaluation.baselines import Fitted, baseline
 from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened
@@ -110,19 +109,10 @@ def closeness(answers: Tensor, whole: Tensor) -> float:
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
 
-@dataclass(frozen=True)
-class Other:
-    """Another method on the same axes: its accuracy and median latency [ms]."""
-
-    value: float
-    p50: float
-    p95: float
-
-
-def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> str | None:
+def beaten_by(point: Point, others: Mapping[str, Point], figure_name: str) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     own = score_of(figure_name, point.value(figure_name))
-    better = {n: score_of(figure_name, r.value) for n, r in others.items() if r.p50 <= point.p50}
+    better = {n: score_of(figure_name, r.value(figure_name)) for n, r in others.items() if r.p50 <= point.p50}
     best = max(better, key=lambda name: better[name], default=None)
     return best if best is not None and better[best] >= own else None
 
@@ -130,7 +120,7 @@ def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> st
 def draw_front(
     points: Sequence[Point],
     on_front: Sequence[int],
-    others: Mapping[str, Other],
+    others: Mapping[str, Point],
     figure_name: str,
     method: str,
     title: str,
@@ -150,8 +140,8 @@ def draw_front(
         above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
         axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
     for name, other in others.items():
-        axes.plot([other.p50], [other.value], ms=6, **look(name).marked)
-        place = other.p50, other.value
+        axes.plot([other.p50], [other.value(figure_name)], ms=6, **look(name).marked)
+        place = other.p50, other.value(figure_name)
         axes.annotate(name, place, (6, -4), textcoords="offset points", color=look(name).colour)
     logarithmic(axes)
     worst, best = min(y), max(y)  # far-off others would flatten the front
@@ -160,7 +150,7 @@ def draw_front(
         axes.invert_yaxis()
     else:
         axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
-        below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
+        below = [name for name, other in others.items() if other.value(figure_name) < axes.get_ylim()[0]]
         if below:
             axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
     axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
@@ -179,11 +169,11 @@ def draw_front(
     return figure
 
 
-def others_of(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, tuple[Method, float | None]]:
-    """Baselines with the deciding figure of each."""
+def others_of(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, Fitted]:
+    """Baselines whose deciding figure is defined, fitted."""
     fitted = {name: baseline(name, run.data, run.split, eval_on) for name in baselines}
     figure = DECIDING[run.data.site.scored]
-    return {name: (one.methods[0], one.scores.figures()[figure]) for name, one in fitted.items()}
+    return {name: one for name, one in fitted.items() if one.scores.figures()[figure] is not None}
 
 
 def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float) -> pd.DataFrame:
@@ -206,7 +196,7 @@ def _cell(value: Any) -> Any:
 
 
 def facts_of(
-    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Point], copy_ms: float
 ) -> dict[str, Any]:
     """`tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
@@ -221,7 +211,10 @@ def facts_of(
         f"test/{figure}": full.value(figure),
     }
     for name, other in others.items():
-        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
+        facts |= {
+            f"baseline/{name}/{figure}": other.value(figure),
+            f"baseline/{name}/render_ms_p50": other.p50,
+        }
     return facts
 
 
