@@ -28,7 +28,6 @@ LEVELS = 50
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
-CHANCE = 2.0  # paired standard errors that another confidence must gain to be chosen
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
@@ -333,7 +332,8 @@ def area_parts(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     """Return the confidence of the smallest area under risk-coverage on `rows`.
 
-    The first, mostly the model's own, stays where the gain is within `CHANCE` paired standard errors.
+    The first, mostly the model's own, stays where another gains no more than the paired standard error (the
+    one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
     """
     # Bounded, so that a few fades do not decide which kind is the best.
     loss = bounded(evidence.error[rows])
@@ -341,7 +341,7 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     own, best = next(iter(parts)), min(parts, key=lambda kind: parts[kind].mean())
     gain = parts[own] - parts[best]
     # Both are of the same rows: their difference scatters less than either.
-    return best if gain.mean() > CHANCE * gain.std() / np.sqrt(max(len(gain), 1)) else own
+    return best if gain.mean() > gain.std() / np.sqrt(max(len(gain), 1)) else own
 
 
 def accept(

