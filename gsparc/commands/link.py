@@ -13,11 +13,11 @@ from omegaconf import DictConfig
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import write_summary
-from gsparc.evaluation.table import Table, shown
+from gsparc.evaluation.table import Table, format_number
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
-    return finish(run_dir, facts, *tables(facts, title, list(points), levels))
+    return finish_run(run_dir, facts, *tables(facts, title, list(points), levels))
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
@@ -72,7 +72,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     rates = [
         [
             f"{level:g}",
-            *(shown(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
+            *(format_number(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
         ]
         for level in levels
     ]
@@ -81,7 +81,14 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     if modulations:
         keys = ("ebno_at_bler_0.1", "behind_perfect_db")
         errors = [
-            [label, *(shown(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
+            [
+                label,
+                *(
+                    format_number(facts[f"pusch/{m}/{name}/{key}"], ".2f")
+                    for m in modulations
+                    for key in keys
+                ),
+            ]
             for name, (label, _, _) in STYLES.items()
             if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
         ]
@@ -93,7 +100,9 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )
     if antennas:
-        beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
+        beams = [
+            [str(n), *(format_number(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas
+        ]
         heads = ["antennas", *BEAMS.values()]
         sections.append(Table.of_texts("maximum-ratio beams, all test positions", [], heads, beams))
     return sections

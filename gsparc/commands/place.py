@@ -15,7 +15,7 @@ from gsparc.apps.maps.placing import (
     unheard_stations_error,
 )
 from gsparc.apps.maps.promised import promise_of, trained
-from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.output import coordinates, finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.models import checkpoint
@@ -67,4 +67,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")
-    return finish(run_dir, facts, lines=lines, before=f"{len(placing.places)} candidates; ")
+    return finish_run(run_dir, facts, lines=lines, before=f"{len(placing.places)} candidates; ")

@@ -12,7 +12,7 @@ from gsparc.apps.maps.pictures import draw_plan_picture
 from gsparc.apps.maps.planning import plan_next
 from gsparc.apps.maps.promised import promise_of
 from gsparc.commands.map import settings_of, stations_of
-from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.output import coordinates, finish_run, run_directory
 from gsparc.commands.shared.settings import plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
@@ -50,4 +50,4 @@ def task(config: DictConfig) -> dict[str, Any]:
         kind = "walk" if config.walkable is None else "drive"
         before += f", a {kind} of {plan.length_m:.0f} m, straight from place to place"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
-    return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")
+    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")

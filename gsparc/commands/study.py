@@ -13,16 +13,16 @@ import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.done import State, content
+from gsparc.evaluation.experiment.done import State, measurements_hash
 from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Condition, Study
 from gsparc.evaluation.summary import run_conditions, write_samples
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, estimate
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
@@ -60,7 +60,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     split = split_for(plain(config.split), data)
     try:
         # Rounds that were done on other data, splits or settings do not count as these.
-        state = State.of(config, content(data), split.sha256)
+        state = State.of(config, measurements_hash(data), split.sha256)
         rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
@@ -72,7 +72,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")
-    finish(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))
+    finish_run(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))
     return rows
 
 
@@ -81,6 +81,6 @@ def table_of(rows: pd.DataFrame, title: str) -> Table:
     changed = [Column("changed", "", of=lambda row: str(Condition(row["what"], row["amount"])))]
     words = [Column("variant", "", of="variant"), Column("effects", "", of="effects")]
     words += changed if (rows.what != "none").any() else []
-    value = Column(rows.figure.iloc[0], of=estimate("value", "spread"))
+    value = Column(rows.figure.iloc[0], of=value_with_error("value", "spread"))
     columns = [*words, Column("rows", "g", of="rows"), value, TRAIN, CPU, P50, P95]
     return Table.of(title, columns, rows.to_dict("records"))  # type: ignore[arg-type]

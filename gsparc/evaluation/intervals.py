@@ -43,7 +43,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         figures |= {"interval/coverage_90": float((error <= half).mean())}
         figures |= {"interval/width_db": float(2 * half.mean())}
         figures |= {CALIBRATION: float(np.mean((error / spread_db[heard]) ** 2))}
-    level_db = levels(data)
+    level_db = sensitivity_levels(data)
     if level_db is None:
         return figures
     of_row = level_db[0 if data.station is None else data.station[row]]
@@ -72,7 +72,7 @@ def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float |
     return {CALIBRATION: float(np.mean(scores.samples["mse"][known] / variance[known]))}
 
 
-def levels(data: Measurements) -> np.ndarray | None:
+def sensitivity_levels(data: Measurements) -> np.ndarray | None:
     """Level (T,) [dB] below which each station hears nothing; None where every one heard all.
 
     NaN where it heard all, or its silent rows have several levels, as in lists of the strongest.
@@ -91,7 +91,7 @@ def levels(data: Measurements) -> np.ndarray | None:
     return level
 
 
-def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
+def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
@@ -107,15 +107,15 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
 
 
-def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies and `reduced_chi_squared`; of powers also `with_silent`, `power_intervals` and, of stations
-    held out, errors left after a constant of each.
+def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
+    """Accuracies and `reduced_chi_squared`; of powers also `rmse_with_silent`, `power_intervals` and, of
+    stations held out, errors left after a constant of each.
     """
     figures = scores.figures()
     if data.site.kind != "rssi":
         figures |= reduced_chi_squared(scores, data)
     else:
-        figures |= with_silent(scores, data) | power_intervals(scores, data)
+        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
             figures["rmse_db_after_constant"] = scores.after_constant(data.station)
     return figures

@@ -120,12 +120,12 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
-    lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *chosen_model(facts), *cost]
+    lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
     # The candidate's name, as stored summaries have it, is no word for users.
     return [line.replace("joint_powers", "powers of all stations") for line in lines]
 
 
-def chosen_model(facts: Mapping[str, Any]) -> list[str]:
+def describe_model(facts: Mapping[str, Any]) -> list[str]:
     """Return which method was chosen and what it is made of, then what it learned, of a law or of beams."""
     made, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
@@ -215,7 +215,7 @@ def _cell(value: Any) -> Any:
     return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
 
 
-def git(folder: Path, *arguments: str) -> str | None:
+def run_git(folder: Path, *arguments: str) -> str | None:
     """Return what git says in a folder, None where it fails."""
     # `git status` would lock the index to refresh it, and a run that is killed then leaves the lock.
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
@@ -229,11 +229,11 @@ def git(folder: Path, *arguments: str) -> str | None:
 def _git() -> str | None:
     here = Path(__file__).resolve()
     # None in an installed copy inside someone else's tree.
-    if git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
+    if run_git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
         return None
-    commit = git(here.parent, "rev-parse", "HEAD")
+    commit = run_git(here.parent, "rev-parse", "HEAD")
     # Untracked files are mostly results of runs: with them every tree would count as edited.
-    edited = commit and git(here.parent, "status", "--porcelain", "--untracked-files=no")
+    edited = commit and run_git(here.parent, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}-dirty" if edited else commit
 
 

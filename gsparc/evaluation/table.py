@@ -38,7 +38,7 @@ class Interval:
         """`29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
         ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
         error = "" if self.error is None or math.isnan(self.error) else f" ± {self.error:{form}}"
-        return f"{shown(self.value, form)}{ends}{error}"
+        return f"{format_number(self.value, form)}{ends}{error}"
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,11 @@ class Column:
         """Return a cell as text."""
         if isinstance(value, Interval):
             return value.text(self.form)
-        return shown(value, self.form) if value is None or isinstance(value, (int, float)) else str(value)
+        return (
+            format_number(value, self.form)
+            if value is None or isinstance(value, (int, float))
+            else str(value)
+        )
 
 
 # Of all tables of results; seconds are means over folds, each of which trains a model.
@@ -75,7 +79,7 @@ P50 = Column("query ms p50", ".3g", of="query_ms")
 P95 = Column("p95", ".3g", of="query_p95_ms")
 
 
-def estimate(name: str, error: str) -> Callable[[Row], Interval]:
+def value_with_error(name: str, error: str) -> Callable[[Row], Interval]:
     """Return what makes `value ± error` of two columns of the results."""
     return lambda row: Interval(row[name], error=row[error])
 
@@ -160,6 +164,6 @@ class Table:
         return result
 
 
-def shown(value: float | None, form: str) -> str:
+def format_number(value: float | None, form: str) -> str:
     """Return a number in a format, or a dash where there is none or NaN."""
     return "-" if value is None or math.isnan(value) else format(value, form)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.intervals import levels, power_intervals, reduced_chi_squared, with_silent
+from gsparc.evaluation.intervals import (
+    power_intervals,
+    reduced_chi_squared,
+    rmse_with_silent,
+    sensitivity_levels,
+)
 from gsparc.evaluation.scores import Scores
 
 COUNT, LEVEL = 4000, -80.0
@@ -35,7 +40,7 @@ def scored(data, mean_db, spread_db):
 
 
 def test_the_level_is_that_of_the_file(drawn):
-    assert levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
+    assert sensitivity_levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
 
 
 def test_a_true_law_is_calibrated(drawn):
@@ -83,14 +88,14 @@ def test_silent_rows_counted_nowhere(drawn):
     )
     squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
     both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
-    found = [with_silent(one, data)["rmse_db_with_silent"] for one in both]
+    found = [rmse_with_silent(one, data)["rmse_db_with_silent"] for one in both]
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
 
 
 def test_levels_of_lists_are_none_of_a_station(drawn):
     """The last list's level was taken for the sensitivity of a station."""
     data = replace(drawn[0], target=drawn[0].target * np.linspace(1, 2, COUNT, dtype=np.float32)[:, None])
-    assert np.isnan(levels(data)).all()
+    assert np.isnan(sensitivity_levels(data)).all()
 
 
 def test_no_variance_no_figures(drawn):
@@ -122,4 +127,4 @@ def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_d
     silent = replace(data, censored=side)
     one = scored(silent, np.full(COUNT, -np.inf), 6.0)
     one = replace(one, samples={**one.samples, "error_db": np.zeros(COUNT)})
-    assert with_silent(one, silent)["rmse_db_with_silent"] < 200
+    assert rmse_with_silent(one, silent)["rmse_db_with_silent"] < 200

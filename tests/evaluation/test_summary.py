@@ -15,11 +15,11 @@ from rich.console import Console
 
 import gsparc.evaluation.summary
 from gsparc.evaluation.summary import (
-    git,
     program_version,
     provenance,
     remarks,
     results_table,
+    run_git,
     write_samples,
     write_summary,
 )
@@ -92,7 +92,7 @@ def test_a_killed_run_left_a_lock_in_the_repository(tmp_path):
     index = tmp_path / ".git" / "index"
     os.utime(file, (1, 1))
     before = index.read_bytes()
-    assert git(tmp_path, "status", "--porcelain") == "A  file"
+    assert run_git(tmp_path, "status", "--porcelain") == "A  file"
     assert index.read_bytes() == before
 
 

@@ -26,8 +26,8 @@ from gsparc.data.own import interpreted
 from gsparc.data.raw import read_raw
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, aligned, open_files
-from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
+from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Table
 from gsparc.prediction.predictor import keep
@@ -185,7 +185,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
-        heard = snapshots(run.data, rows_of(run.split.folds[0], config.eval_on))
+        heard = snapshots(run.data, rows_to_score(run.split.folds[0], config.eval_on))
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays
@@ -194,7 +194,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
-        other = aligned(interpreted(raw, config.data), site)
+        other = align_to_site(interpreted(raw, config.data), site)
         heard = snapshots(other, np.arange(len(other)))
     return heard.at(sample(config, len(heard))), placed
 

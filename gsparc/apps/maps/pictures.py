@@ -24,12 +24,12 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import (
     OUTLINE,
     annotate,
-    bounded,
     draw_measured,
     draw_sectors,
     draw_stations,
     legend_below,
     scale_bar,
+    set_bounds,
 )
 from gsparc.prediction.predictor import Predictor
 
@@ -219,7 +219,7 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
-    bounded(axis, (left, low), (right, high), title=title)
+    set_bounds(axis, (left, low), (right, high), title=title)
     draw_places(axis, field)
     scale_bar(axis)
     if field.refused.any():
@@ -299,7 +299,7 @@ def draw_plan_picture(
         image = np.full(batch.grid.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
-        bounded(axis, (left, low), (right, high), ylabel="", title=title)
+        set_bounds(axis, (left, low), (right, high), ylabel="", title=title)
         scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
@@ -326,7 +326,7 @@ def draw_placing(placing: Placing, path: Path, threshold_db: float, unit: str = 
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     draw_stations(axis, placing.stations)
     draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
-    bounded(axis, (left, low), (right, high))
+    set_bounds(axis, (left, low), (right, high))
     scale_bar(axis)
     legend_below(figure)
     save(figure, path, 100)

@@ -13,7 +13,7 @@ from gsparc.data.instantiate import GROUPS, node_of, plugins
 from gsparc.simulate.scenes.shipped import settings, shipped
 
 
-def offer() -> None:
+def offer_plugins() -> None:
     """Make every plugin a choice of its config group, with its settings and their defaults.
 
     One that cannot be imported is warned of and left out.

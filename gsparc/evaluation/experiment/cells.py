@@ -71,7 +71,7 @@ class Cell:
         return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
 
 
-def plugged() -> dict[str, Contender]:
+def plugin_contenders() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
     found = {}
     for name, path in plugins("model").items():
@@ -97,7 +97,7 @@ class Budget:
     splits: tuple[str, ...] = ()
 
 
-def plan(
+def plan_cells(
     problems: Sequence[Problem],
     methods: Mapping[str, Contender],
     budgets: Sequence[Budget],

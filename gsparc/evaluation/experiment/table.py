@@ -15,7 +15,7 @@ from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.metric_formats import CALIBRATION, form_of, heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, estimate
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 
 SECOND: dict[Scored, str] = {
     "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
@@ -47,8 +47,8 @@ ROW = [
 ]  # fmt: skip
 
 
-def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
-    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
+def table_of_cells(filled: Sequence[Filled]) -> pd.DataFrame:
+    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
     rows = []
     for one in filled:
         own = one.row
@@ -66,7 +66,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def average_cells(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
@@ -90,7 +90,7 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
-    cells = cells_of(filled)
+    cells = table_of_cells(filled)
     if cells.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
     cells["behind_db"] = _behind(cells)
@@ -135,7 +135,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
     return behind
 
 
-def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
+def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
     """Return a table per dataset, split and budget, best first; methods without a budget stand in each."""
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
@@ -195,14 +195,14 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
     """Return a block as a table, the row of `ours` bold, without columns that no row fills."""
-    figure, draws, score = block.figure.iloc[0], block.draws.any(), estimate("score_db", "spread_db")
+    figure, draws, score = block.figure.iloc[0], block.draws.any(), value_with_error("score_db", "spread_db")
     # Of the others it is the score but for its sign.
     valued = figure.startswith("nmse") or (figure == "rmse_db" and not draws)
-    value = estimate("value", "value_error")
+    value = value_with_error("value", "value_error")
     columns = [
         (True, Column("method", "", of=lambda row: row["method"] + row["label"])),
         (True, Column(SCORE[figure], ".2f", of=score)),
-        (draws, Column("behind the best, dB", ".2f", of=estimate("behind_db", "behind_error_db"))),
+        (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (valued, Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second.iloc[0], of="second_value")),
         *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
@@ -223,7 +223,7 @@ def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
     )
 
 
-def by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
+def methods_by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
     """Methods, the least behind first: mean over the splits that each is possible on."""
     behind = rows.assign(behind_db=rows.behind_db.fillna(0.0)).groupby("method", sort=False).behind_db.mean()
     return list(behind.sort_values(kind="stable").index)

@@ -20,7 +20,9 @@ SEED = Column("seed", "d", of="seed")
 SIZE = Column("Gaussians", "d", of="gaussians")
 
 
-def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int = 0) -> tuple[float, float]:
+def bootstrap_interval(
+    values: np.ndarray, weights: np.ndarray | None = None, seed: int = 0
+) -> tuple[float, float]:
     """Ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights), resampling samples.
 
     Samples are taken as independent; neighbours under `split=grouped` are not, so it is a lower bound.
@@ -34,13 +36,13 @@ def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int =
     return float(np.quantile(means, tail)), float(np.quantile(means, 1 - tail))
 
 
-def interval(row: Row, figure: str) -> Interval | None:
+def interval_of_figure(row: Row, figure: str) -> Interval | None:
     """Return a test figure of a row with its bootstrap interval over test samples, or None."""
     # Baselines have no samples of their own here, only figures.
     value, parts = row.get(figure), None if row["baseline"] else _parts(row["run"].samples, figure)
     if value is None:
         return None
-    return Interval(value) if parts is None else Interval(value, *bootstrap(*parts))
+    return Interval(value) if parts is None else Interval(value, *bootstrap_interval(*parts))
 
 
 def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
@@ -56,7 +58,7 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     return (values, None) if len(values) > 1 else None
 
 
-def over_seeds(values: Sequence[float | None]) -> Interval | None:
+def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
     """Mean, least and largest over those seeds that have a value; None where none has."""
     known = [value for value in values if value is not None]
     # A single seed has no spread: no brackets.
@@ -65,12 +67,12 @@ def over_seeds(values: Sequence[float | None]) -> Interval | None:
     return Interval(float(np.mean(known)), min(known), max(known))
 
 
-def accuracy(figure: str, note: str = "") -> Column:
+def accuracy_column(figure: str, note: str = "") -> Column:
     """Return a test figure, with its interval."""
-    return Column(heading_of(figure), form_of(figure), note, partial(interval, figure=figure))
+    return Column(heading_of(figure), form_of(figure), note, partial(interval_of_figure, figure=figure))
 
 
-def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs that differ by their seed only, by setting, in order of appearance."""
     groups: dict[str, list[Run]] = {}
     for run in runs:
@@ -78,11 +80,11 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return groups
 
 
-def results(runs: Sequence[Run]) -> Table:
+def table_of_results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
+    note = "95 % interval: bootstrap over test samples"
     columns = [
-        SETTING, SEED,
-        *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].row["kind"]]),
+        SETTING, SEED, *(accuracy_column(f, note) for f in TABLES[runs[0].row["kind"]]),
         Column(heading_of(CALIBRATION), form_of(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
@@ -99,17 +101,17 @@ def results(runs: Sequence[Run]) -> Table:
     return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
 
 
-def seeds(runs: Sequence[Run]) -> Table:
+def table_of_seeds(runs: Sequence[Run]) -> Table:
     """Settings side by side, their spread over seeds, and what they cost."""
-    differs = differing(runs)
+    differs = differing_settings(runs)
     also = [Column("differs, too", "")] if any(differs.values()) else []
     spread = _spread_columns(runs)
     rows = [
         [
             setting, *([differs[setting]] if also else []), len(group),
-            *(over_seeds([column.value(run.row) for run in group]) for column in spread),
+            *(interval_over_seeds([column.value(run.row) for run in group]) for column in spread),
         ]
-        for setting, group in grouped(runs).items()
+        for setting, group in group_by_setting(runs).items()
     ]  # fmt: skip
     columns = [SETTING, *also, Column("seeds", "d"), *spread]
     return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
@@ -123,9 +125,9 @@ def _spread_columns(runs: Sequence[Run]) -> list[Column]:
     return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 
-def differing(runs: Sequence[Run]) -> dict[str, str]:
+def differing_settings(runs: Sequence[Run]) -> dict[str, str]:
     """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
-    groups = grouped(runs)
+    groups = group_by_setting(runs)
     every = {setting: group[0].resolved for setting, group in groups.items()}
     # Names of all runs: a setting may be in one alone.
     names = dict.fromkeys(name for one in every.values() for name in one)
@@ -139,7 +141,7 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
     }
 
 
-def worst(runs: Sequence[Run]) -> Table:
+def table_of_worst(runs: Sequence[Run]) -> Table:
     """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
     numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]

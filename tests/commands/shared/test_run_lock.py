@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared import run_lock
-from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, RunLock, hold, locked, release
+from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, RunLock, hold_folder, locked, release_folders
 from gsparc.commands.train import LEFT, train
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import read_run
@@ -51,19 +51,19 @@ def test_training_from_python_took_no_lock(other, tmp_path):
     other.wait()
     with locked(tmp_path), pytest.raises(ValueError, match="another run writes here"), locked(tmp_path):
         pass
-    hold(tmp_path)  # as a command does before it trains
+    hold_folder(tmp_path)  # as a command does before it trains
     with locked(tmp_path):
         pass
-    release()
+    release_folders()
 
 
 def test_a_released_folder_is_free(tmp_path):
-    hold(tmp_path)
-    release()
-    hold(tmp_path)
+    hold_folder(tmp_path)
+    release_folders()
+    hold_folder(tmp_path)
     with pytest.raises(InUse, match=r"another run writes here \(process \d+ on "):
-        hold(tmp_path)
-    release()
+        hold_folder(tmp_path)
+    release_folders()
 
 
 @pytest.mark.parametrize("words", [
@@ -93,8 +93,8 @@ def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwa
     assert not (folder / ".hydra").exists()
     if taken == HOLDER:
         (folder / taken).rmdir()
-        hold(folder)  # the lock was not left behind
-        release()
+        hold_folder(folder)  # the lock was not left behind
+        release_folders()
 
 
 def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_path, monkeypatch):
@@ -141,7 +141,7 @@ def test_a_new_run_went_on_in_the_log_of_the_one_before(goes_on, kept, tmp_path,
     try:
         RunLock().on_run_start(config)
     finally:
-        release()
+        release_folders()
     assert (tmp_path / "train.log").exists() == kept
 
 
@@ -169,6 +169,6 @@ def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):
     kept = [here / f".c.json.{os.getppid()}.partial", here / ".mine.partial", here / ".d.e.partial"]
     for path in kept:
         path.write_text("half")
-    hold(here)
-    release()
+    hold_folder(here)
+    release_folders()
     assert sorted(here.rglob("*.partial")) == sorted(kept)

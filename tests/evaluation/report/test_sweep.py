@@ -14,7 +14,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.console import Screen
+from gsparc.evaluation.console import ConsoleHandler
 from gsparc.evaluation.report.sweep import FAILURE, SweepReport
 
 ROOT = Path(__file__).parents[3]
@@ -36,7 +36,7 @@ def test_a_failure_is_said_once_and_kept_and_the_sweep_goes_on(tmp_path, caplog)
     SweepReport().on_job_end(of_job(tmp_path), job)
     assert job.status == JobStatus.COMPLETED and job.return_value is None
     assert (tmp_path / FAILURE).read_text() == "no such file\n"
-    screen = Screen(stream=shown)
+    screen = ConsoleHandler(stream=shown)
     for record in caplog.records:
         screen.handle(record)
     assert shown.getvalue() == f"error: job {tmp_path.name} (seed=3) failed, others go on: no such file\n"
