@@ -105,7 +105,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
     run.stored = [SimpleNamespace(extra={})]
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
-    monkeypatch.setattr(command, "rows_of", lambda *_: None)
+    monkeypatch.setattr(command, "rows_to_score", lambda *_: None)
     for name in ("known_positions", "position_kernel"):
         monkeypatch.setattr(command.confidence, name, lambda *_: None)
     kept = []

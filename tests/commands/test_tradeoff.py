@@ -103,7 +103,7 @@ def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
     points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
-    monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
+    monkeypatch.setattr(operating_point, "time_interleaved", lambda calls, clock, threads: pretended)
     best = max(points, key=lambda p: p.score)
     assert gsparc.load(ckpt, budget_ms=1e6).point == best
     assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]

@@ -91,7 +91,7 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
         text.get_text(): line.get_marker()
         for text, line in zip(legend.texts, legend.get_lines(), strict=True)
     }
-    assert marks == {name: pictures.look(name).mark for name in ("gp", "gsparc", "gsrf")}
+    assert marks == {name: pictures.style_of(name).mark for name in ("gp", "gsparc", "gsrf")}
 
 
 def test_losers_are_not_hidden():
