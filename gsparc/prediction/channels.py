@@ -23,7 +23,7 @@ SUBCARRIERS_PER_BLOCK = 12
 def centred_grid(middle_hz: float, spacing_hz: float, count: int) -> np.ndarray:
     """Return frequencies (count,) [Hz] of a grid about `middle_hz`.
 
-    >>> centred(100.0, 10.0, 4).tolist()
+    >>> centred_grid(100.0, 10.0, 4).tolist()
     [85.0, 95.0, 105.0, 115.0]
     """
     return middle_hz + (np.arange(count) - (count - 1) / 2) * spacing_hz
@@ -35,8 +35,8 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     The best linear interpolation of channels whose delays fill `WINDOW_S` evenly about their mean; a single
     tone is repeated.
 
-    >>> tones = centred(2.4e9, 1e6, 16)
-    >>> between = interpolated(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
+    >>> tones = centred_grid(2.4e9, 1e6, 16)
+    >>> between = interpolate_tones(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
     >>> between.shape, bool((between[0, 5:10] - 1).abs().max() < 0.05)  # of a channel without delay
     (torch.Size([1, 15]), True)
 

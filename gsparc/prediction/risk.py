@@ -143,7 +143,7 @@ def choose_threshold(
     could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
 
     >>> score = np.linspace(0, 1, 100)
-    >>> choose(score, score < 0.5, levels_of(score), Guarantee()).accepted >= 50  # all bad ones are unsure
+    >>> choose_threshold(score, score < 0.5, threshold_levels(score), Guarantee()).accepted >= 50
     True
     """
     threshold = Threshold(float("inf"), 0, 0)

@@ -117,7 +117,7 @@ def cycle_queries(methods: Mapping[Key, Method], queries: Sequence[Query]) -> di
 def median_and_p95(times: np.ndarray) -> tuple[float, float]:
     """Return median and 95th percentile of times (n,).
 
-    >>> percentiles(np.arange(101.0))
+    >>> median_and_p95(np.arange(101.0))
     (50.0, 95.0)
     """
     return float(np.median(times)), float(np.quantile(times, 0.95))

@@ -52,7 +52,7 @@ from gsparc.commands.shared import cli
 names = [command.name for command in COMMANDS.values() if command.configured]
 with initialize_config_module("gsparc.conf", version_base="1.3"):
     for name in names:
-        cli.overview("", name), compose(name)
+        cli.help_text("", name), compose(name)
     compose("train", ["model=splat", "model.field.count=3", "paper=gsrf"])
 sys.exit("torch" in sys.modules)
 """

@@ -197,7 +197,7 @@ def strip_comments(text: str) -> str:
 
     By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
 
-    >>> code_of("mark = '#'  # of a comment")
+    >>> strip_comments("mark = '#'  # of a comment")
     "mark = '#'"
     """
     code = REMARK.sub(lambda one: one[1] or "", text)

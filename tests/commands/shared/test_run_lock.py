@@ -18,8 +18,10 @@ from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import read_run
 from gsparc.models import checkpoint
 
-HOLDS = "import sys, time; from gsparc.commands.shared.run_lock import hold; from pathlib import Path; "
-HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+HOLDS = (
+    "import sys, time; from gsparc.commands.shared.run_lock import hold_folder; from pathlib import Path; "
+)
+HOLDS += "hold_folder(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
 
 
 @pytest.fixture
