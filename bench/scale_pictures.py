@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.drawing import logarithmic, look, panels, save
+from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
 
 MANY = 10_000  # rows from which slopes are taken: fewer are of exact methods, or too quick to time
 QUANTITIES = {
@@ -29,9 +29,9 @@ def draw(tables: Path, pictures: Path) -> None:
                     slope = np.polyfit(np.log10(many["rows"]), np.log10(many[quantity]), 1)[0]
                     label += f", slope {slope:.2f}"
                 place.errorbar(
-                    lines["rows"], lines[quantity], errors, label=label, capsize=2, **look(name).marked
+                    lines["rows"], lines[quantity], errors, label=label, capsize=2, **style_of(name).marked
                 )
             place.set(title=title, xlabel="rows", yscale="linear" if quantity == "peak_gb" else "log")
-            logarithmic(place, fine=False)
+            set_log_axis(place, fine=False)
         figure.legend(*places[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         save(figure, pictures / f"scale-{source}.png")

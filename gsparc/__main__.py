@@ -6,7 +6,7 @@ import os
 import sys
 from importlib.metadata import version
 
-from gsparc.commands.listing import COMMANDS, listed, nearest
+from gsparc.commands.listing import COMMANDS, listed, suggest_command
 
 READER_LEFT = 141  # a shell's status of a process that wrote to a closed pipe
 
@@ -35,7 +35,7 @@ def _run() -> None:
         sys.stdout.write(f"gsparc {version('gsparc')}\n")
         return
     if name not in COMMANDS:
-        sys.stderr.write(f"error: no command is called {name!r}{nearest(name)}\n")
+        sys.stderr.write(f"error: no command is called {name!r}{suggest_command(name)}\n")
         sys.exit(1)
     command = COMMANDS[name]
     sys.argv = [f"gsparc {name}", *command.arguments(sys.argv[2:])]

@@ -8,7 +8,7 @@ import pytest
 from gsparc.data.assemble import identity_hash
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
-from gsparc.evaluation.experiment.done import content
+from gsparc.evaluation.experiment.done import measurements_hash
 from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
 from gsparc.ops import SphereGrid
@@ -42,7 +42,7 @@ def _keys(data, monkeypatch) -> dict[str, str]:
     with pytest.raises(Asked) as key_of_vectors:
         vector_cache.recover_cached(data, rows)
     found["vectors"] = str(key_of_vectors.value)
-    found["cells"] = content(data)
+    found["cells"] = measurements_hash(data)
     return found
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gsparc.evaluation.drawing import logarithmic, look, panels, save
+from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "compare" / "compare.csv"
@@ -44,7 +44,7 @@ def main() -> None:
     figure, (axes,) = panels(9.0 if timed else 6.5, 4.2, 1, 1 + timed, sharey=True)
     for row in rows:
         text, *beside = METHODS[row["method"]]
-        style = look(row["method"])
+        style = style_of(row["method"])
         ours = row["method"] == "gsparc"
         for axis, cost, (right, up) in zip(axes, ("train_cpu_s", "query_ms"), beside, strict=False):
             place = max(float(row[cost]), 1e-3), float(row["score_db"])
@@ -57,7 +57,7 @@ def main() -> None:
     labels = ("training, seconds of one processor", "one query [ms], one thread")
     for axis, label, limits in zip(axes, labels, ((3e-4, 600), (0.01, 20)), strict=False):
         axis.set(xlabel=label, xlim=limits, ylim=(15, 30.5))
-        logarithmic(axis, fine=False)
+        set_log_axis(axis, fine=False)
     axes[0].set_ylabel("PSNR of 32 test spectra [dB]")
     save(figure, HERE / "accuracy-against-time.png")
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gsparc.evaluation.drawing import look, panels, save
+from gsparc.evaluation.drawing import panels, save, style_of
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "fronts" / "effort.csv"
@@ -25,7 +25,7 @@ def main() -> None:
     for axis, name in zip(axes, names, strict=True):
         own = [row for row in rows if row["data"] == name]
         seconds, error = ([float(row[key]) for row in own] for key in ("processor_s", "error"))
-        axis.plot(seconds, error, **look("gsparc").marked, markersize=6)
+        axis.plot(seconds, error, **style_of("gsparc").marked, markersize=6)
         for row, x, y in zip(own, seconds, error, strict=True):
             axis.annotate(row["effort"], (x, y), (4, 5), textcoords="offset points", fontsize=8)
         middle, least = sum(error) / len(error), float(own[0]["noise"])

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish, run_directory
-from gsparc.evaluation.summary import shown, table, write_samples
-from gsparc.prediction.bench import Call, cases, loss, step
-from gsparc.prediction.timing import ClockSettings, interleaved
+from gsparc.commands.shared.output import finish_run, run_directory
+from gsparc.evaluation.table import Column, Table
+from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
+from gsparc.prediction.timing import ClockSettings, time_interleaved
 
-HEADS = ("kernel", "size", "seconds", "in torch", "times faster")
+COLUMNS = (
+    Column("kernel", ""), Column("size", ""), Column("seconds", ".3g"), Column("in torch", ".3g"),
+    Column("times faster", ".3g"),
+)  # fmt: skip
 # A dense reference may take seconds: after half a second no new round begins.
 REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
 
@@ -21,22 +24,25 @@ REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
 def task(config: DictConfig) -> dict[str, Any]:
     """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
-    every = [case for of in product(config.counts, config.projections) for case in cases(*of)]
+    every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of)]
     # Emission and channels are the same under every projection: a dictionary keeps one of each.
-    chosen = {(case.name, case.size): case for case in [*every, loss(), *map(step, config.projections)]}
+    chosen = {
+        (case.name, case.size): case
+        for case in [*every, loss_case(), *map(training_step_case, config.projections)]
+    }
     rows, facts = [], {}
     for (name, size), case in chosen.items():
         seconds = median_s(case.kernel, clock)
         reference = None if case.reference is None else median_s(case.reference, REFERENCE)
         ratio = None if reference is None else reference / seconds
-        rows.append([name, size, *(shown(value, ".3g") for value in (seconds, reference, ratio))])
+        rows.append([name, size, seconds, reference, ratio])
         facts[f"bench/{name}/{size}/seconds"] = seconds
-    write_samples(run_directory() / "bench.csv", dict(zip(HEADS, zip(*rows, strict=True), strict=True)))
-    sheet = table("", HEADS[:2], HEADS[2:], rows)
-    sheet.caption = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
-    return finish(run_directory(), facts, sheet)
+    note = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
+    sheet = Table("", COLUMNS, rows, note)
+    (run_directory() / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
+    return finish_run(run_directory(), facts, sheet)
 
 
 def median_s(call: Call, clock: ClockSettings) -> float:
     """Return the median seconds of a call."""
-    return float(np.median(interleaved({0: lambda turn: call()}, clock)[0])) / 1e3
+    return float(np.median(time_interleaved({0: lambda turn: call()}, clock)[0])) / 1e3

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
-from rich.table import Table
 
-from gsparc.commands.shared.output import run_directory, show
+from gsparc.commands.shared.output import run_directory, show_result
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.evaluation.open_runs import collect, store
+from gsparc.evaluation.open_runs import calibrate_and_store, collect_evidence
 from gsparc.evaluation.pictures import NAMES, draw_calibration
-from gsparc.evaluation.summary import provenance, shown, table, write_summary
-from gsparc.prediction.risk import Guarantee, figures, too_few, trials
+from gsparc.evaluation.results import facts_under
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.table import Column, Interval, Table
+from gsparc.prediction.risk import Guarantee, calibration_facts, run_trials, too_few
 from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
@@ -26,19 +28,19 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = plain(config)
-    evidence, known = collect(paths, settings["dataset"], settings["split"])
+    evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
     # Refused here, before hundreds of draws would fail in the same way.
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
-    divisions = [trials(evidence, promise, "random", *draws)]
+    divisions = [run_trials(evidence, promise, "random", *draws)]
     try:
-        divisions.append(trials(evidence, promise, "spatial", *draws))
+        divisions.append(run_trials(evidence, promise, "spatial", *draws))
     except ValueError:
         # With fewer patches than parts no division by whole cells exists.
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
-    facts = known | figures(evidence, divisions, promise) | machine_facts() | provenance()
+    facts = known | calibration_facts(evidence, divisions, promise) | machine_facts() | provenance()
     facts["seed"] = config.seed
     # Written before a threshold is stored: where storing fails, these figures are there.
     write_summary(run_dir / "summary.json", facts)
@@ -49,43 +51,40 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:
-            stored, bound = store(path, settings["dataset"], settings["split"], *how)
+            stored, bound = calibrate_and_store(path, settings["dataset"], settings["split"], *how)
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             stored_lines.append(f"{path}: {bound}")
         write_summary(run_dir / "summary.json", facts)
-    show(run_dir, *tables(facts), lines=stored_lines)
+    show_result(run_dir, *calibration_tables(facts), lines=stored_lines)
     return facts
 
 
-def tables(facts: dict[str, Any]) -> list[Table]:
+def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     """Return tables of confidences side by side, and of bounds beside what came of them."""
-    wanted = {
-        "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
-        "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),
-    }  # fmt: skip
     curves = [
-        [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
-        for kind in NAMES
-        if f"confidence/{kind}/area" in facts
-    ]
-    draws = []
-    for how in ("random", "spatial"):
-        # Spatial draws were left out where the patches were too few.
-        if f"trial/{how}/kind" not in facts:
-            continue
-        own = {key.rpartition("/")[2]: value for key, value in facts.items() if f"trial/{how}/" in key}
-        ends = f"{own['broken_low'] or 0:.0%} to {own['broken_high'] or 0:.0%}"
-        broken = "-" if own["broken"] is None else f"{own['broken']:.1%}, {ends}"
-        draws.append([
-            how, own["kind"], f"{own['coverage']:.0%}", shown(own["realised"], ".1%"), broken,
-            f"{own['broken_of_all']:.1%}", f"{facts['promise/delta']:.0%}", f"{own['silent']:.0%}",
-        ])  # fmt: skip
-    numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
+        Column("confidence", "", of="kind"), Column("area under risk-coverage", of="area"),
+        Column("below distance", ".0%", of="area_below_distance"),
+        Column("risk at 70 %", of="risk_at_70"), Column("rank", ".2f", of="rank_correlation"),
+    ]  # fmt: skip
+    kinds = [{"kind": kind, **facts_under(facts, f"confidence/{kind}")} for kind in NAMES]
+    draws = [
+        Column("split", "", of="how"), Column("confidence", "", of="kind"),
+        Column("accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
+        Column("broken", ".1%", of=_broken), Column("of all draws", ".1%", of="broken_of_all"),
+        Column("promised", ".0%", of=lambda row: facts["promise/delta"]),
+        Column("accepted nobody", ".0%", of="silent"),
+    ]  # fmt: skip
+    # Spatial draws are left out where the patches are too few.
+    trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
     heading = f"{facts['dataset/name']}: {facts['positions']} positions of {facts['model/name']}"
     promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
     return [
-        table(heading, ["confidence"], list(wanted), curves),
-        table(promise, ["split", "confidence"], numbers, draws),
+        Table.of(heading, curves, [row for row in kinds if "area" in row]),
+        Table.of(promise, draws, [row for row in trials_of if "coverage" in row]),
     ]
+
+
+def _broken(row: Mapping[str, Any]) -> Interval | None:
+    return None if row["broken"] is None else Interval(row["broken"], row["broken_low"], row["broken_high"])

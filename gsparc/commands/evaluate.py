@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
@@ -76,4 +76,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)
-    return finish(run_dir, facts, results, lines=remarks(facts, config.eval_on))
+    return finish_run(run_dir, facts, results, lines=remarks(facts, config.eval_on))

@@ -12,15 +12,15 @@ from omegaconf import DictConfig
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
 from gsparc.apps.export.along.taps import Trajectory, write_taps
-from gsparc.apps.export.compiled.blob import write_form
-from gsparc.apps.export.compiled.make import FIGURES, compile_model
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.apps.export.compile_model.blob import write_form
+from gsparc.apps.export.compile_model.make import FIGURES, compile_model
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.prediction.operating_point import load
-from gsparc.prediction.placing import in_world, with_heights
+from gsparc.prediction.placing import fill_heights, to_world
 from gsparc.prediction.predictor import Predictor
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
@@ -45,7 +45,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)
     facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
-    return finish(run_directory(), facts, lines=lines, before="summary ")
+    return finish_run(run_directory(), facts, lines=lines, before="summary ")
 
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
@@ -66,8 +66,8 @@ def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
     if config.table is None:
         raise SettingError(f"table=null: to={config.to} needs a file of places")
     site = predictor.site
-    queries = with_heights(read_query_places(config.table, (site.moving_end,)), site)
-    return in_world(queries, site)[site.moving_end]
+    queries = fill_heights(read_query_places(config.table, (site.moving_end,)), site)
+    return to_world(queries, site)[site.moving_end]
 
 
 def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:

@@ -10,14 +10,14 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import shown, table, write_summary
+from gsparc.evaluation.summary import write_summary
+from gsparc.evaluation.table import Table, format_number
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
-    return finish(run_dir, facts, *tables(facts, title, list(points), levels))
+    return finish_run(run_dir, facts, *tables(facts, title, list(points), levels))
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
@@ -72,28 +72,37 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     rates = [
         [
             f"{level:g}",
-            *(shown(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
+            *(format_number(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
         ]
         for level in levels
     ]
     heads = ["median SNR dB", *(head for head, _ in RATES.values())]
-    sections = [table(f"{title}: throughput, {accepted}", [], heads, rates)]
+    sections = [Table.of_texts(f"{title}: throughput, {accepted}", [], heads, rates)]
     if modulations:
         keys = ("ebno_at_bler_0.1", "behind_perfect_db")
         errors = [
-            [label, *(shown(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
+            [
+                label,
+                *(
+                    format_number(facts[f"pusch/{m}/{name}/{key}"], ".2f")
+                    for m in modulations
+                    for key in keys
+                ),
+            ]
             for name, (label, _, _) in STYLES.items()
             if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
         ]
         heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
         numbers = [column for modulation in modulations for column in (modulation, "behind")]
-        sections.append(table(heading, ["receiver"], numbers, errors))
+        sections.append(Table.of_texts(heading, ["receiver"], numbers, errors))
     # As numbers: as text 16 comes before 4.
     antennas = sorted(
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )
     if antennas:
-        beams = [[str(n), *(shown(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
+        beams = [
+            [str(n), *(format_number(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas
+        ]
         heads = ["antennas", *BEAMS.values()]
-        sections.append(table("maximum-ratio beams, all test positions", [], heads, beams))
+        sections.append(Table.of_texts("maximum-ratio beams, all test positions", [], heads, beams))
     return sections

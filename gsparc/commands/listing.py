@@ -45,7 +45,7 @@ class Command:
         from gsparc.commands.shared import cli
 
         if {"--help", "-h"} & {*sys.argv[1:]}:  # before torch is imported
-            sys.stdout.write(cli.overview(self.answers, self.name))
+            sys.stdout.write(cli.help_text(self.answers, self.name))
         else:
             # Imported, with torch, once the words are understood.
             cli.run(lambda config: import_module(path).task(config), self.name)
@@ -85,7 +85,7 @@ def listed() -> str:
     return f"gsparc COMMAND key=value ...\n\n{rows}\n`gsparc COMMAND --help` lists a command's settings.\n"
 
 
-def nearest(name: str) -> str:
+def suggest_command(name: str) -> str:
     """Return `; did you mean 'train'?`, or what there is."""
     # Below difflib's 0.6, as names of commands are short: one letter is a large share.
     close = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.5)

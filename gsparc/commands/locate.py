@@ -11,7 +11,7 @@ from gsparc.apps.locate.fingerprints import locate_fingerprints
 from gsparc.apps.locate.judging import locate_by_model, report
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 
@@ -38,4 +38,4 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
         plan = read_plan_settings(plain(config))
         localisation = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
     facts, tables, lines = report(localisation, config.against, run_dir)
-    return finish(run_dir, facts, *tables, lines=lines)
+    return finish_run(run_dir, facts, *tables, lines=lines)

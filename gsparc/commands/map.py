@@ -13,7 +13,7 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
 from gsparc.apps.maps.promised import map_notes, read_or_gather
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples
@@ -105,4 +105,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     if field.calibrated:
         before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
     before += "; map "
-    return finish(run_dir, facts, lines=lines, before=before)
+    return finish_run(run_dir, facts, lines=lines, before=before)

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promised import read_or_gather, reopen_training
-from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.output import coordinates, finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.models import checkpoint
@@ -61,4 +61,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     ]
     if not error.stations:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")
-    return finish(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")
+    return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

@@ -13,7 +13,7 @@ from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promised import read_or_gather
 from gsparc.commands.map import settings_of, stations_of
-from gsparc.commands.shared.output import coordinates, finish, run_directory
+from gsparc.commands.shared.output import coordinates, finish_run, run_directory
 from gsparc.commands.shared.settings import plain
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
@@ -56,4 +56,4 @@ def task(config: DictConfig) -> dict[str, Any]:
         kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
         before += f", a way of {plan.length_m:.0f} m, {kind}"
     lines = [line for line in (plan.stopped, plan.in_vain) if line]
-    return finish(run_dir, facts, lines=lines, before=f"{before}; plan ")
+    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")

@@ -6,9 +6,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.evaluation.answers import predict
+from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
 
 
@@ -18,7 +18,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
     how: dict[str, Any] = {"columns": plain(config.columns), "overwrite": bool(config.overwrite)}
-    facts = predict(predictor, config.places, config.out, station=station, **how)
+    facts = predict_file(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
@@ -27,4 +27,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f"; predictions in {facts['out']}; summary "
-    return finish(run_directory(), facts | {"ckpt": str(config.ckpt)}, before=before)
+    return finish_run(run_directory(), facts | {"ckpt": str(config.ckpt)}, before=before)

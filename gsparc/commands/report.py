@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.report.page import studies, write
-from gsparc.evaluation.report.runs import find_runs, read_columns, retime
+from gsparc.evaluation.report.page import make_sections, write_report
+from gsparc.evaluation.report.runs import find_runs, read_columns, time_again
 from gsparc.evaluation.summary import program_version, provenance, write_summary
 
 
@@ -28,18 +28,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     runs = find_runs(paths)
     # Times of other days and machines do not compare: every model is asked anew, here.
     if config.retime:
-        runs = retime(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
+        runs = time_again(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
     out = run_directory()
-    sections = studies(runs, _fronts(paths))
+    sections = make_sections(runs, _fronts(paths))
     origin = provenance()
     note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program_version(origin)}"
-    write(out, config.title, note, sections, config.figures)
+    write_report(out, config.title, note, sections, config.figures)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
-    for run in runs:
-        stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
-        own = {"train_s": "train_s", "render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms"}
-        own[run.row["figure"]] = "value"
-        facts |= {f"{stem}/{name}": run.row[column] for name, column in own.items()}
     write_summary(out / "summary.json", facts)
     console = open_console()
     console.print(f"{note}; written to {out / 'report.html'}", highlight=False)

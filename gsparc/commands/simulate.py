@@ -56,7 +56,7 @@ def task(config: DictConfig) -> Outcome | None:
     RunSettings.of(config)
     run_dir, console = run_directory(), open_console()
     if config.scene.name == "help":
-        console.print(simulated.shipped_scenes())
+        console.print(simulated.table_of_scenes())
         console.print(OTHERS)
         return None
     out = Path(to_absolute_path(str(config.out)))
@@ -65,7 +65,7 @@ def task(config: DictConfig) -> Outcome | None:
     with locked(out.with_name(out.name + ".parts"), "out"):
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
-    simulated.floor_plan(outcome, run_dir / "floor_plan.png")
+    simulated.draw_floor_plan(outcome, run_dir / "floor_plan.png")
     triangles = outcome.survey.engine.triangles()
     # The exact shoebox has walls, but no triangles.
     if len(triangles):

@@ -1,7 +1,6 @@
 """`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
 
-Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
-accuracy under its own name, seconds of training and milliseconds of a query.
+Leaves `study.csv`, a row a variant and condition (`study.ROW`), `study.png` and `summary.json`.
 """
 
 from __future__ import annotations
@@ -13,17 +12,17 @@ from typing import Any
 import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
-from rich.table import Table
 
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.done import State, content
+from gsparc.evaluation.experiment.done import State, measurements_hash
 from gsparc.evaluation.experiment.folds import context_of
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Study, facts_of
-from gsparc.evaluation.summary import TRAIN_S, run_conditions, shown, table, write_samples
+from gsparc.evaluation.experiment.study import Condition, Study
+from gsparc.evaluation.summary import run_conditions, write_samples
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
@@ -61,34 +60,27 @@ def task(config: DictConfig) -> pd.DataFrame:
     split = split_for(plain(config.split), data)
     try:
         # Rounds that were done on other data, splits or settings do not count as these.
-        state = State.of(config, content(data), split.sha256)
+        state = State.of(config, measurements_hash(data), split.sha256)
         rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
         raise KeyboardInterrupt(message) from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": study.rounds, **facts_of(rows),
+        "seed": settings.seed, "study/rounds": study.rounds,
     }  # fmt: skip
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")
-    finish(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))
+    finish_run(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))
     return rows
 
 
 def table_of(rows: pd.DataFrame, title: str) -> Table:
     """Return a table with a line per row; conditions where the study has any."""
-    changed = (rows.what != "none").any()
-    costs = {
-        "train_s": TRAIN_S, "train_cpu_s": "cpu s/fold", "query_ms": "query ms", "query_p95_ms": "p95"
-    }  # fmt: skip
-    lines = []
-    for row in rows.to_dict("records"):
-        change = row["what"] if row["what"] == "none" else f"{row['what']} {row['amount']:g}"
-        value = f"{row['value']:.4g}" + ("" if pd.isna(row["spread"]) else f" ± {row['spread']:.2g}")
-        words = [row["variant"], row["effects"], *([change] if changed else [])]
-        lines.append([*words, f"{row['rows']:g}", value, *(shown(row[name], ".3g") for name in costs)])
-    words = ["variant", "effects", *(["changed"] if changed else [])]
-    numbers = ["rows", rows.figure.iloc[0], *costs.values()]
-    return table(title, words, numbers, lines)
+    changed = [Column("changed", "", of=lambda row: str(Condition(row["what"], row["amount"])))]
+    words = [Column("variant", "", of="variant"), Column("effects", "", of="effects")]
+    words += changed if (rows.what != "none").any() else []
+    value = Column(rows.figure.iloc[0], of=value_with_error("value", "spread"))
+    columns = [*words, Column("rows", "g", of="rows"), value, TRAIN, CPU, P50, P95]
+    return Table.of(title, columns, rows.to_dict("records"))  # type: ignore[arg-type]

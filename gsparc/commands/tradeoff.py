@@ -13,22 +13,23 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish, in_multirun, run_directory
+from gsparc.commands.shared.output import finish_run, in_multirun, run_directory
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import plain
 from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
-from gsparc.evaluation.experiment.done import State, content, once
+from gsparc.evaluation.experiment.done import State, measurements_hash, run_once
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
-from gsparc.evaluation.scores import rows_of
-from gsparc.evaluation.summary import table, write_samples
-from gsparc.models.pareto import front
+from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.table import Column, Table
+from gsparc.models.pareto import Point, front
 from gsparc.models.reduced import combinations, reduced
 from gsparc.prediction import operating_point
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, percentiles, reference_copy
+from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, reference_copy
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
@@ -38,17 +39,17 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
-    state = State.of(config, content(run.data), run.split.sha256)
+    state = State.of(config, measurements_hash(run.data), run.split.sha256)
     trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
     state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
     with locked(run_dir / ".job"):
-        return once(run_dir, state, lambda left: _swept(config, run, run_dir), again=not in_multirun())
+        return run_once(run_dir, state, lambda left: _swept(config, run, run_dir), again=not in_multirun())
 
 
 def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     """Measure, draw and write."""
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
-    rows = rows_of(fold, config.eval_on)
+    rows = rows_to_score(fold, config.eval_on)
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = method.contributions(data, learned)
@@ -57,26 +58,25 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, reduced(method, some, measured)) for some in settings]
-    others = tradeoff.others_of(run, config.baselines, config.eval_on)
+    others = tradeoff.fit_others(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
-    clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
+    clocks = {name: Predictor(one.methods[0], data.site).cycling(places) for name, one in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
-    points, other_ms = tradeoff.sweep(candidates, threads, data, fold, **how)
+    points, other_ms = tradeoff.measure_candidates(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.scored]
     pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
-        operating_point.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
+        operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
-        name: tradeoff.Other(value, *percentiles(other_ms[name]))
-        for name, (_, value) in others.items()
-        if value is not None
+        name: Point(name, {}, 1, one.scores.figures(), np.nan, other_ms[name], 0)
+        for name, one in others.items()
     }
     copy_ms = float(np.median(other_ms[COPY]))
-    table_of_points = tradeoff.table_of(points, pareto, chosen, copy_ms)
+    table_of_points = tradeoff.table_of_points(points, pareto, chosen, copy_ms)
     write_samples(run_dir / "tradeoff.csv", table_of_points.to_dict("list"))
     best = [points[i] for i in pareto]
     title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
@@ -88,12 +88,12 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         "time/includes": "one query end to end: world position in, physical units out; warm",
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
-    heads, lines = tradeoff.cells_of(best, figure)
+    front_rows = table_of_points[table_of_points.front == 1].to_dict("records")
+    sheet = Table.of(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
     with tracking.opened(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
-        tracking.log_table(loggers, "operating points", heads, lines)
-    sheet = table(title, ["not beaten"], heads[1:], lines)
-    finish(run_dir, facts, sheet, lines=tradeoff.irreducible(method))
+        tracking.log_table(loggers, "operating points", *sheet.texts())
+    finish_run(run_dir, facts, sheet, lines=tradeoff.why_irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.
     for p in best:
         other = tradeoff.beaten_by(p, beside, figure)

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared import cli
-from gsparc.commands.shared.output import in_multirun, run_directory, show
+from gsparc.commands.shared.output import in_multirun, run_directory, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings
 from gsparc.data import heeded
@@ -34,13 +34,13 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import State, content, finished, once, program
+from gsparc.evaluation.experiment.done import State, measurements_hash, program_hash, read_finished, run_once
 from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
-from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
-from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import build, complete, known
@@ -107,7 +107,7 @@ def begin(config: DictConfig, known: Measurements | None = None) -> Begun:
     """
     method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.of(config)
-    watch, reads = TimeBudget(clock=config.budget_clock), options.noting(config, method)
+    watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
     with heeded.recording(reads):
         module = _data(config, known)
         return Begun(method, module, split_for(plain(config.split), module.measurements), reads, watch)
@@ -154,9 +154,9 @@ def train(
                 fits = fit_folds(method, data, split, contexts, keep=keep)
                 # Some options are read by answers alone: one query, before unused options are listed.
                 asked = "train" if split.name == "none" else config.eval_on
-                fits.methods[0].predict(data.batch(rows_of(split.folds[0], asked)[:1]))
+                fits.methods[0].predict(data.batch(rows_to_score(split.folds[0], asked)[:1]))
 
-            unused = options.unheeded(reads, fits.methods[0], data)
+            unused = options.warn_of_unheeded(reads, fits.methods[0], data)
             evaluation = evaluate(
                 fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
                 shared=_as_baseline(config, method), timed=in_full,
@@ -164,7 +164,7 @@ def train(
 
             facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}
             facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
-            facts["program"] = program(plain(config))
+            facts["program"] = program_hash(plain(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
             objects = Objects(fits.methods, files, data, split, evaluation)
             if in_full:
@@ -203,7 +203,7 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
             config.dataset[key] = whole if several else whole[0]
     if start is not None:
         try:
-            module.measurements = aligned(module.measurements, checkpoint.read(start).site)
+            module.measurements = align_to_site(module.measurements, checkpoint.read(start).site)
         except ValueError as error:
             raise ValueError(f"init_from={start}: {error}") from None
     return module
@@ -311,6 +311,8 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
 def _of_fits(fits: Outcome) -> dict[str, Any]:
     cpu_s = statistics.fmean(fits.train_cpu_s)
     facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
+    said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
+    facts["model/learned"] = "\n".join(said) or None
     if fits.cost.stages:
         facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
     return facts
@@ -332,8 +334,8 @@ def _draw(
         title = f"{data.site.name}: test rows of {method.label}"
         draw_predictions(method, data, fold, title, run_dir / "test.png")
         tracking.log_picture(loggers, "test rows", run_dir / "test.png")
-    table = summary.result_rows(facts, str(facts["model/label"]), config.eval_on)
-    tracking.log_table(loggers, "results", *table)
+    table = summary.results_table(facts, str(facts["model/label"]), prefix=config.eval_on)
+    tracking.log_table(loggers, "results", *table.texts())
     found = method.objects()
     if len(found):
         draw_found(data, found, run_dir / "found.png", _known_walls(config))
@@ -341,7 +343,7 @@ def _draw(
 
 
 def task(config: DictConfig) -> float:
-    """Train as configured and show the table; a job of a multirun is done once, see `once`.
+    """Train as configured and show the table; a job of a multirun is done once, see `run_once`.
 
     Returns:
         The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
@@ -353,14 +355,14 @@ def task(config: DictConfig) -> float:
         log.info("with the settings of the run that it goes on from: %s", words)
     with locked(run_dir / ".job"):  # the run's own is its training's
         unread = State.unread(config) if job else None
-        facts = finished(run_dir, unread, config.reuse) if unread else None
+        facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is not None:
             log.info("%s: was done before", run_dir)
         else:
             begun = begin(config)
-            state = State.of(config, content(begun.module.measurements), begun.split.sha256)
+            state = State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
             work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
-            facts = once(run_dir, state, work, unread=unread, **how)
+            facts = run_once(run_dir, state, work, unread=unread, **how)
     figure = DECIDING[facts["dataset/kind"]]
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
@@ -377,7 +379,7 @@ def _train_and_show(config: DictConfig, begun: Begun, left: str | None) -> None:
     facts, objects = train(config, run_dir, begun)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
     results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, results, lines=summary.remarks(facts, config.eval_on))
+    show_result(run_dir, results, lines=summary.remarks(facts, config.eval_on))
 
 
 def main() -> None:

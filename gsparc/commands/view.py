@@ -15,7 +15,7 @@ from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, plane_grid
 from gsparc.apps.view.viewed import open_model
-from gsparc.commands.shared.output import finish, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
@@ -40,7 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
         "ckpt": str(config.ckpt), **peak_memory(),
     }  # fmt: skip
-    return finish(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
+    return finish_run(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
 
 
 def check(save: Path | None, port: int) -> None:

@@ -2,7 +2,7 @@
 
 A dataclass of settings inherits `Checked` and gives limits beside defaults, such as
 `count: int = setting(500, whole(0))`; a constructor calls `check_arguments`. The error names the setting; the
-command line puts the group it stands in before that (`gsparc.evaluation.console.one_line`).
+command line puts the group it stands in before that (`gsparc.evaluation.console.error_in_one_line`).
 """
 
 from __future__ import annotations

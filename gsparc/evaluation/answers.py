@@ -21,7 +21,14 @@ from gsparc.data.schema import End, Kind, Site
 from gsparc.data.units import PowerUnit
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
-from gsparc.prediction.placing import far_outside, in_a_speck, in_height, in_world, stations_of, with_heights
+from gsparc.prediction.placing import (
+    far_outside,
+    fill_heights,
+    match_stations,
+    say_height_error,
+    say_tiny_extent,
+    to_world,
+)
 from gsparc.prediction.predictor import Predictor
 
 log = logging.getLogger(__name__)
@@ -54,7 +61,7 @@ class Answers:
         return len(self.place)
 
 
-def predict(
+def predict_file(
     predictor: Predictor, places: str | Path, out: str | Path | None = None, *, station: str | None = None,
     columns: dict[str, object] | None = None, overwrite: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
@@ -75,29 +82,31 @@ def predict(
         DataError: anything that is wrong with the places, the station or the file to write.
     """
     site, places = predictor.site, Path(places)
-    path = target(None if out is None else str(out), places, overwrite)
+    path = output_path(None if out is None else str(out), places, overwrite)
     moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
-    queries = with_heights(read_query_places(places, moving, columns or {}), site)
+    queries = fill_heights(read_query_places(places, moving, columns or {}), site)
     for note in _notes(queries, site):
         log.info("%s: %s", places, note)
-    world = in_world(queries, site)
-    row, number = stations_of(queries, site, station)
+    world = to_world(queries, site)
+    row, number = match_stations(queries, site, station)
     named = station is not None or queries.station is not None
     far, margin = far_outside(world, site)
     # `check_fits` is asked after the first block: spectra for a csv are refused before all are predicted.
-    predictions = answers(predictor, queries, world, row, number, named, partial(check_fits, path, site.kind))
-    speck = in_a_speck(queries, world, site)
+    predictions = predict_places(
+        predictor, queries, world, row, number, named, partial(check_fits, path, site.kind)
+    )
+    speck = say_tiny_extent(queries, world, site)
     if speck is not None:
         log.warning("%s: %s", places, speck)
     if far.any():
         log.warning(
             "%s: %d of %d places lie more than %.3g m outside the box of the training places%s, the first in "
             "%s: predictions there are unreliable",
-            places, int(far.sum()), len(far), margin, in_height(world, site, far),
+            places, int(far.sum()), len(far), margin, say_height_error(world, site, far),
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip
     power = site.power_unit(predictor.unit) if site.kind == "rssi" else None
-    write(path, queries, predictions, site.kind, power)
+    write_answers(path, queries, predictions, site.kind, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
@@ -109,7 +118,7 @@ def predict(
     known = predictions.mean[np.isfinite(predictions.mean)]
     if power is not None and len(known):
         ends = {"lowest": float(known.min()), "highest": float(known.max())}
-        facts |= {f"predict/{name}_{suffix(power)}": value for name, value in ends.items()}
+        facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}
     return facts
 
 
@@ -123,7 +132,7 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
     return notes
 
 
-def answers(
+def predict_places(
     predictor: Predictor,
     queries: QueryPlaces,
     world: dict[End, np.ndarray],
@@ -138,7 +147,7 @@ def answers(
         predictor: of the model.
         queries: for messages.
         world: (n, 3) [m] by end.
-        row, number: (N,) of each prediction, see `stations_of`.
+        row, number: (N,) of each prediction, see `match_stations`.
         named: whether somebody asked for these stations; then one without a model is refused.
         accept: raises where predictions of a shape are not wanted; called after the first ones.
 
@@ -185,7 +194,7 @@ def answers(
     return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
 
 
-def target(out: str | None, places: Path, overwrite: bool) -> Path:
+def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
     """Return where predictions go: `out`, or beside the places.
 
     Raises:
@@ -215,17 +224,17 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
         raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
 
 
-def suffix(unit: PowerUnit) -> str:
+def unit_suffix(unit: PowerUnit) -> str:
     """Return the ending of columns and figures of powers: `db` of any levels, else the unit."""
     return "db" if unit.decibels else unit.name
 
 
-def write(
+def write_answers(
     path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind, power: PowerUnit | None
 ) -> None:
     """Write all predictions, whole or not at all; NaN for the level of no power."""
     archive = path.suffix.lower() == ".npz"
-    columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{suffix(power)}"
+    columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
     if kind == "rssi":
         values = predictions.mean[:, 0]
         columns[name] = np.where(np.isfinite(values), values, np.float32(np.nan))

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.folds import fit_folds
-from gsparc.evaluation.scores import Scores, score
+from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.models.method import Method
 from gsparc.models.per_station import trained_stations
 from gsparc.models.registry import method_class
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 
 
-def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
+def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     """Names of all plain methods that serve these measurements and rows."""
     site, names = data.site, BASELINES
     if site.kind == "rssi":
@@ -39,7 +39,7 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedBaseline:
     """A baseline on every fold of a split.
 
     Attributes:
@@ -53,13 +53,13 @@ class Fitted:
     train_s: tuple[float, ...]
 
 
-def baseline(
+def fit_baseline(
     name: str,
     data: Measurements,
     split: Split,
     eval_on: str = "test",
     learned: tuple[Measurements, Split] | None = None,
-) -> Fitted:
+) -> FittedBaseline:
     """Fit the baseline `name` with its default settings on each fold, and score it.
 
     Args:
@@ -82,4 +82,4 @@ def baseline(
 
     contexts = [FitContext(Path())] * len(before.folds)
     fits = fit_folds(method_class(name)(), own, before, contexts, learned=known, keep=said)
-    return Fitted(fits.methods, score(fits.methods, data, split, eval_on), fits.train_s)
+    return FittedBaseline(fits.methods, score_methods(fits.methods, data, split, eval_on), fits.train_s)

@@ -38,7 +38,7 @@ def open_console() -> Console:
     return terminal if known else Console(soft_wrap=True, markup=False, width=WIDE)
 
 
-class Screen(logging.StreamHandler):  # type: ignore[type-arg]
+class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
     """The log as the console shows it: messages alone, and of each kind of warning the first.
 
     The log's file has every line, with time, level and module.
@@ -68,9 +68,9 @@ class Screen(logging.StreamHandler):  # type: ignore[type-arg]
         return level + record.getMessage().strip().partition("\n")[0]
 
 
-def warned_again() -> list[str]:
+def repeated_warnings() -> list[str]:
     """Return a command's last line on warnings that its log's file has more of, or none."""
-    screens = [one for one in logging.getLogger().handlers if isinstance(one, Screen)]
+    screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
     more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
     again = [f"{n} like '{re.sub(PATH, '', first)[:AGAIN]} ...'" for n, first in more]
     return [f"warnings that came again: {', '.join(again)}"] if again else []
@@ -81,7 +81,7 @@ def plain(node: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
 
-def one_line(error: BaseException) -> str:
+def error_in_one_line(error: BaseException) -> str:
     """Return what went wrong and what to do, on one line; misspelt keys and choices get the nearest name."""
     if isinstance(error, errors.MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, choice = str(error.missing_cfg_file).partition("/")
@@ -104,7 +104,7 @@ def one_line(error: BaseException) -> str:
         where = re.search(r"full_key: (\S+)", str(error))
         if isinstance(error.__cause__, SettingError) and where:
             return f"{where[1]}.{error.__cause__}"
-        return one_line(error.__cause__)
+        return error_in_one_line(error.__cause__)
     if isinstance(error, errors.HydraException):
         return " ".join(str(error).split())
     if isinstance(error, OmegaConfBaseException) and error.full_key:
@@ -139,6 +139,7 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
     hint = suggest_or_list(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
+    hint = "; say hydra/launcher=joblib, too, or ray" if prefix == "hydra.launcher" else hint
     return f"{full}: no such setting{hint}"
 
 

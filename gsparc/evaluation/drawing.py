@@ -41,7 +41,7 @@ STYLE: dict[Any, Any] = {
 PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 
-class Look(NamedTuple):
+class MethodStyle(NamedTuple):
     """How a method is drawn: colour, mark, whether it is the second of its colour (open, dashed)."""
 
     colour: str
@@ -61,43 +61,43 @@ class Look(NamedTuple):
 
 # The same method looks the same everywhere; of two drawn together in one colour one is the second.
 METHODS = {
-    "gsparc": Look("#D55E00", "*"),
-    "blind": Look("#D55E00", "P", True),
-    "gp": Look("#0072B2", "s"),
-    "complex_gp": Look("#0072B2", "D", True),
-    "idw": Look("#009E73", "o"),
-    "calibrated_raytracer": Look("#009E73", "v", True),
-    "swiftwrf": Look("#CC79A7", "X"),
-    "distance_law": Look("#CC79A7", "v"),
-    "newrf": Look("#CC79A7", "^", True),
-    "paper": Look("#E69F00", "s"),
-    "gaussians": Look("#E69F00", "o", True),
-    "kriging": Look("#56B4E9", "p"),
-    "residual": Look("#56B4E9", "h", True),
-    "wrfgs": Look("#4B5320", "D"),
-    "array": Look("#4B5320", "X", True),
-    "nerf2": Look("#000000", "o"),
-    "image_source_gp": Look("#000000", "v"),
-    "nearest": Look("#332288", "^"),
-    "gsrf": Look("#882255", "P"),
-    "ngrf": Look("#882255", "s", True),
-    "mean": Look(GREY, "o"),
-    "zero": Look(GREY, "X", True),
+    "gsparc": MethodStyle("#D55E00", "*"),
+    "blind": MethodStyle("#D55E00", "P", True),
+    "gp": MethodStyle("#0072B2", "s"),
+    "complex_gp": MethodStyle("#0072B2", "D", True),
+    "idw": MethodStyle("#009E73", "o"),
+    "calibrated_raytracer": MethodStyle("#009E73", "v", True),
+    "swiftwrf": MethodStyle("#CC79A7", "X"),
+    "distance_law": MethodStyle("#CC79A7", "v"),
+    "newrf": MethodStyle("#CC79A7", "^", True),
+    "paper": MethodStyle("#E69F00", "s"),
+    "gaussians": MethodStyle("#E69F00", "o", True),
+    "kriging": MethodStyle("#56B4E9", "p"),
+    "residual": MethodStyle("#56B4E9", "h", True),
+    "wrfgs": MethodStyle("#4B5320", "D"),
+    "array": MethodStyle("#4B5320", "X", True),
+    "nerf2": MethodStyle("#000000", "o"),
+    "image_source_gp": MethodStyle("#000000", "v"),
+    "nearest": MethodStyle("#332288", "^"),
+    "gsrf": MethodStyle("#882255", "P"),
+    "ngrf": MethodStyle("#882255", "s", True),
+    "mean": MethodStyle(GREY, "o"),
+    "zero": MethodStyle(GREY, "X", True),
 }
 OTHERS = "<>8H"  # marks of methods without an entry
 TOGETHER = "_together"  # ends the name of a method that serves all stations at once
 
 
-def look(method: str) -> Look:
+def style_of(method: str) -> MethodStyle:
     """Return how a method is drawn; one without an entry by its name."""
     if method.endswith(TOGETHER):
-        return look(method.removesuffix(TOGETHER))._replace(second=True)
+        return style_of(method.removesuffix(TOGETHER))._replace(second=True)
     number = zlib.crc32(method.encode())
     mark = OTHERS[number // len(PALETTE) % len(OTHERS)]
-    return METHODS.get(method, Look(PALETTE[number % len(PALETTE)], mark, True))
+    return METHODS.get(method, MethodStyle(PALETTE[number % len(PALETTE)], mark, True))
 
 
-def numbered(number: int) -> dict[str, Any]:
+def numbered_style(number: int) -> dict[str, Any]:
     """Colour and line style of the setting with this number, where settings are drawn and not methods."""
     return {
         "color": PALETTE[number % len(PALETTE)],
@@ -121,7 +121,7 @@ def panels(
     return figure, axes
 
 
-def logarithmic(axes: Any, fine: bool | None = None) -> None:
+def set_log_axis(axes: Any, fine: bool | None = None) -> None:
     """Horizontal axis in decades; plain numbers also between them if `fine`, None: where decades are few.
 
     Linear where nothing is above zero.

@@ -12,14 +12,21 @@ import numpy as np
 from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baselines import Fitted, baseline, fitting
-from gsparc.evaluation.intervals import pooled
+from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
+from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metrics import paired_values
-from gsparc.evaluation.scores import Scores, rows_of, score, unseen_runs
+from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
-from gsparc.prediction.timing import COPY, ClockSettings, cycling, interleaved, percentiles, queries
+from gsparc.prediction.timing import (
+    COPY,
+    ClockSettings,
+    cycle_queries,
+    draw_queries,
+    median_and_p95,
+    time_interleaved,
+)
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +84,7 @@ def evaluate(
         `dataset/*`, `split/*`.
 
     Raises:
-        ValueError: as in `score`.
+        ValueError: as in `score_methods`.
     """
     methods = (methods,) if isinstance(methods, Method) else tuple(methods)
     seconds = None if train_s is None else [float(s) for s in np.atleast_1d(train_s)]
@@ -85,23 +92,23 @@ def evaluate(
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     if split.name == "none" and eval_on == "test":
         return Evaluation(_about(methods, seconds, data, split), {})
-    scores = score(methods, data, split, eval_on)
+    scores = score_methods(methods, data, split, eval_on)
     # Which baselines serve is decided by the rows that they learn from, not by those scored.
-    names = fitting(*(learned or (data, split))) if baselines is None else baselines
+    names = baselines_for(*(learned or (data, split))) if baselines is None else baselines
     if fitted := [name for name in names if name != shared]:
         log.info("%-10s%s", "baselines", ", ".join(fitted))
     # A method that is a baseline (model=gp) has one fit and one row: another would only differ in seconds.
-    same = Fitted(methods, scores, tuple(seconds or ()))
-    others = {n: same if n == shared else baseline(n, data, split, eval_on, learned) for n in names}
+    same = FittedBaseline(methods, scores, tuple(seconds or ()))
+    others = {n: same if n == shared else fit_baseline(n, data, split, eval_on, learned) for n in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
     alone = [method.field_alone() for method in methods]
     fields = [one for one in alone if one is not None]
     # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):
-        every[FIELD] = score(fields, data, split, eval_on)
+        every[FIELD] = score_methods(fields, data, split, eval_on)
     for stem, one in every.items():
-        own = {**pooled(one, data, split), "skill": _skill(one, others)}
+        own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
     facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
     decided = scores.decided_by()
@@ -112,7 +119,7 @@ def evaluate(
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
     if FIELD in every:
         contenders[FIELD] = fields[0]
-    facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock) if timed else {}
+    facts |= time_methods(contenders, data, rows_to_score(split.folds[0], eval_on), clock) if timed else {}
     facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
     facts |= _about(methods, seconds, data, split)
     if FIELD in every:
@@ -134,7 +141,7 @@ def _about(
     }  # fmt: skip
 
 
-def latencies(
+def time_methods(
     methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
 ) -> dict[str, float | int | str | None]:
     """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns.
@@ -142,12 +149,12 @@ def latencies(
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    singles = cycling(methods, queries(data, rows, 1))
-    one = interleaved({**singles, COPY: timing.reference_copy()}, clock)
+    singles = cycle_queries(methods, draw_queries(data, rows, 1))
+    one = time_interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     # A median: one interruption by another process moves a mean of few rounds.
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
-    many = interleaved(cycling(quick, queries(data, rows, BATCH)), fewer)
+    many = time_interleaved(cycle_queries(quick, draw_queries(data, rows, BATCH)), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
@@ -160,7 +167,7 @@ def latencies(
     }
     for name in methods:
         room = {OWN: "time", FIELD: FIELD}.get(name, f"baseline/{name}")
-        p50, p95 = percentiles(one[name])
+        p50, p95 = median_and_p95(one[name])
         facts |= {
             f"{room}/render_ms_p50": p50,
             f"{room}/render_ms_p95": p95,
@@ -190,7 +197,7 @@ def split_facts(split: Split) -> dict[str, Any]:
     return {"split/name": split.name, "split/sha256": split.sha256, "split/folds": len(split.folds), **counts}
 
 
-def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
+def _skill(scores: Scores, others: Mapping[str, FittedBaseline]) -> float | None:
     """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour, or when that one is right."""
     if "nearest" not in others:
         return None
@@ -199,7 +206,7 @@ def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
     return 1 - own / bar if bar > 0 else None
 
 
-def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:
+def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measurements) -> dict[str, Any]:
     # The last three are the moving end's place: where both move, columns are tx, then rx.
     world = data.moving[scores.row][:, -3:] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]

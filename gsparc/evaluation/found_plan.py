@@ -13,8 +13,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import bounded, draw_stations, framed, legend_below
-from gsparc.evaluation.site_plan import still_ends
+from gsparc.evaluation.from_above import draw_stations, frame_of, legend_below, set_bounds
+from gsparc.evaluation.site_plan import static_positions
 
 INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
@@ -29,13 +29,13 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     """
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
-    ends = still_ends(data)
+    ends = static_positions(data)
     points = np.concatenate([places[:, :2], ends])
     # Walls that stand apart from all places are on the map, too; those far away would make it a dot.
     middle, extent = points.mean(0), np.linalg.norm(np.ptp(points, axis=0))
     feet = np.array([foot for _, foot in _upright(objects.planes, origin, middle)]).reshape(-1, 2)
     points = np.concatenate([points, feet[np.linalg.norm(feet - middle, axis=1) <= FARTHEST * extent]])
-    low, high = framed(points, AROUND if len(objects.planes) else MARGIN)
+    low, high = frame_of(points, AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
     axis = axes[0, 0]
@@ -50,7 +50,7 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     level = _draw_planes(axis, objects.planes, origin, low, high)
     if len(ends):
         draw_stations(axis, ends, "ends that stand")
-    bounded(axis, low, high)
+    set_bounds(axis, low, high)
     legend_below(figure)
     title = f"{data.site.name}: what the field found"
     figure.suptitle(title if not level else f"{title}\n{level}", fontsize="medium")

@@ -19,7 +19,7 @@ DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)]
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
-def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
+def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     """Equal scales from corner (2,) to corner (2,) [m], in plain numbers; "x [m]" unless labels say more."""
     labels = {"xlabel": "x [m]", "ylabel": "y [m]"} | labels
     across, up = np.transpose([low, high])
@@ -29,7 +29,7 @@ def bounded(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
 
 
-def framed(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
     """Corners (2,) of a map: the known ones of places (n, 2) and a share of their extent around them."""
     known = places[np.isfinite(places).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)

@@ -1,4 +1,4 @@
-"""How honest predicted variances of powers are: intervals that hold the truth, outages that come true."""
+"""How honest predicted variances are: errors over deviations, intervals that hold the truth, outages."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from scipy.stats import norm
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
+from gsparc.evaluation.metric_formats import CALIBRATION
 from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
@@ -18,6 +19,7 @@ SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """Figures of predicted normal distributions of decibels; empty where the method has no variance.
 
+    `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
     `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
     of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
@@ -37,9 +39,11 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     if heard.any():
         # z of .95 is 1.645 for the central 90 % of a normal distribution.
         half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
-        inside = np.abs(10 * np.log10(power[heard]) - mean_db[heard]) <= half
-        figures |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
-    level_db = levels(data)
+        error = np.abs(10 * np.log10(power[heard]) - mean_db[heard])
+        figures |= {"interval/coverage_90": float((error <= half).mean())}
+        figures |= {"interval/width_db": float(2 * half.mean())}
+        figures |= {CALIBRATION: float(np.mean((error / spread_db[heard]) ** 2))}
+    level_db = sensitivity_levels(data)
     if level_db is None:
         return figures
     of_row = level_db[0 if data.station is None else data.station[row]]
@@ -56,7 +60,19 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     }
 
 
-def levels(data: Measurements) -> np.ndarray | None:
+def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float | None]:
+    """Return the mean squared error over its predicted variance; empty where the method has no variance.
+
+    1 where `Predictor.std` is right on average, above where it is too small, below where it is too large.
+    """
+    variance = scores.variance * data.site.target_scale**2
+    known = np.isfinite(scores.samples["mse"]) & (variance > 0)
+    if not known.any():
+        return {}
+    return {CALIBRATION: float(np.mean(scores.samples["mse"][known] / variance[known]))}
+
+
+def sensitivity_levels(data: Measurements) -> np.ndarray | None:
     """Level (T,) [dB] below which each station hears nothing; None where every one heard all.
 
     NaN where it heard all, or its silent rows have several levels, as in lists of the strongest.
@@ -75,7 +91,7 @@ def levels(data: Measurements) -> np.ndarray | None:
     return level
 
 
-def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
+def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
@@ -91,13 +107,15 @@ def with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
 
 
-def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies; of powers also `with_silent`, `power_intervals` and, of stations held out, errors left
-    after a constant of each.
+def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
+    """Accuracies and `reduced_chi_squared`; of powers also `rmse_with_silent`, `power_intervals` and, of
+    stations held out, errors left after a constant of each.
     """
     figures = scores.figures()
-    if data.site.kind == "rssi":
-        figures |= with_silent(scores, data) | power_intervals(scores, data)
+    if data.site.kind != "rssi":
+        figures |= reduced_chi_squared(scores, data)
+    else:
+        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
             figures["rmse_db_after_constant"] = scores.after_constant(data.station)
     return figures

@@ -42,7 +42,9 @@ FIGURES = {
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
     "skill": Figure("skill", ".3f"),
+    "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
 }
+CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
 # Order matters: `DECIDING` takes the first of each.
 TABLES: dict[Scored, tuple[str, ...]] = {
     "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),

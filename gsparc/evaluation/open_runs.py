@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import counted
-from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
@@ -27,7 +27,15 @@ from gsparc.prediction import confidence
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import SAME_PLACE_M
 from gsparc.prediction.refit import Learned
-from gsparc.prediction.risk import MOST_LAX_DB, Evidence, Guarantee, accept, joined, laxer, too_few
+from gsparc.prediction.risk import (
+    MOST_LAX_DB,
+    Evidence,
+    Guarantee,
+    calibrate_threshold,
+    join_evidence,
+    relax_guarantee,
+    too_few,
+)
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -68,7 +76,7 @@ class Opened:
     def predictor(self) -> Predictor:
         """The first method, as `gsparc.load` answers by it."""
         site, extra = self.stored[0].site, self.stored[0].extra
-        return Predictor(self.methods[0], site, trusted=confidence.trusted_of(extra), extra=extra)
+        return Predictor(self.methods[0], site, trusted=confidence.read_trusted(extra), extra=extra)
 
     def retraining(self, **others: Any) -> Learned:
         """Return the first method with what it learned from; only classes of gsparc make it unfitted.
@@ -112,7 +120,7 @@ def open_files(
     # A class is imported only where the caller named it, never because a file does.
     chosen_class = "_target_" in (dataset or {})
     module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
-    data = aligned(module.measurements, stored[0].site)
+    data = align_to_site(module.measurements, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
@@ -167,7 +175,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
 
 
-def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
+def were_trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
     """Return whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
@@ -186,7 +194,7 @@ def _foreign(
 ) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
     """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
     same = data.site.sha256 == stored[0].site.sha256
-    known = trained_on(stored, chosen)
+    known = were_trained_on(stored, chosen)
     if same and known:
         return None, 0, None
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
@@ -226,15 +234,15 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
             # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None
-            data = aligned(data, site)
+            data = align_to_site(data, site)
         before = _folds(split_for(_settings("split", stored[0], None), data), stored)
     # A file that is gone makes the answer unknown, which is said; it is no reason to refuse.
     except (ValueError, OSError):
         return None
-    return None if trained_on(stored, before) is False else (data, before)
+    return None if were_trained_on(stored, before) is False else (data, before)
 
 
-def aligned(data: Measurements, site: Site) -> Measurements:
+def align_to_site(data: Measurements, site: Site) -> Measurements:
     """Return `data` in the local coordinates and target units (watts, milliwatts) of a model's training.
 
     Raises:
@@ -333,7 +341,7 @@ def _times(values: Any, factor: float) -> Any:
     return values if values is None or factor == 1 else (values * factor).astype(values.dtype)
 
 
-def collect(
+def collect_evidence(
     paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
 ) -> tuple[Evidence, dict[str, Any]]:
     """Gather evidence of every checkpoint's own test rows, no row twice, and the facts that name them."""
@@ -343,15 +351,15 @@ def collect(
         run = _unseen(path, dataset, split)
         fold = run.split.folds[0]
         # Folds and seeds share test rows: a row counts in the evidence once, by the first checkpoint.
-        rows = np.setdiff1d(rows_of(fold, "test"), seen)
+        rows = np.setdiff1d(rows_to_score(fold, "test"), seen)
         if len(rows):
-            parts.append(confidence.gather(run.methods[0], run.data, fold, rows))
+            parts.append(confidence.gather_evidence(run.methods[0], run.data, fold, rows))
         seen = np.concatenate([seen, rows])
         facts = facts or run.facts()
-    return joined(parts), facts
+    return join_evidence(parts), facts
 
 
-def store(
+def calibrate_and_store(
     path: str,
     dataset: dict[str, Any],
     split: dict[str, Any],
@@ -364,12 +372,12 @@ def store(
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
-    evidence = confidence.gather(method, data, fold, rows_of(fold, "test"))
-    kind_used, choice, _, _ = accept(evidence, promise, kind, spatial, seed)
-    threshold = confidence.threshold_of(kind_used, choice)
+    evidence = confidence.gather_evidence(method, data, fold, rows_to_score(fold, "test"))
+    kind_used, choice, _, _ = calibrate_threshold(evidence, promise, kind, spatial, seed)
+    threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(data, fold), confidence.position_kernel(data, fold)
     stored = confidence.Trusted(kind_used, threshold, promise, known, kernel)
-    earlier = confidence.trusted_of(run.stored[0].extra)
+    earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
     kind_changed = f"confidence={kind_used}, before: {before}; "
@@ -377,14 +385,14 @@ def store(
         # Without a promise a choice by chance would replace what falls away from the measurements.
         stored, kind_changed = earlier, f"confidence stays {before}, the checkpoint as it was; "
     else:
-        confidence.keep(path, stored)
+        confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
         of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
     if too_few(len(evidence), promise) is not None:
         return stored, f"{kind_changed}no threshold keeps the bound"
     bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
-    other = laxer(evidence, promise, kind, spatial, seed)
+    other = relax_guarantee(evidence, promise, kind, spatial, seed)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
     )

@@ -13,7 +13,7 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models.method import Method, predictions
-from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded, risk_coverage
+from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
 SPECTRA = 4  # test rows drawn
 
@@ -129,7 +129,7 @@ def draw_calibration(
 ) -> None:
     """Save risk against coverage, and what came of the draws, as one PNG."""
     figure, ((left, right),) = panels(11, 4.2, 1, 2)
-    loss = bounded(evidence.error)
+    loss = bounded_loss(evidence.error)
     coverage = np.arange(1, len(loss) + 1) / len(loss)
     for kind, score in evidence.scores.items():
         risk = risk_coverage(score, loss)

@@ -21,13 +21,13 @@ COSTS = {
 }  # fmt: skip
 
 
-def under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
+def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
     """Return the facts whose names begin with `room/`, without it."""
     stem = f"{room}/"
     return {name[len(stem) :]: value for name, value in facts.items() if name.startswith(stem)}
 
 
-def rows_of(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+def result_rows(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the row of a run's method and those of the baselines beside it, from the facts of its summary.
 
     Columns are those of `OF_RUN`, `OF_MODEL` and `COSTS`; `fold` (None: all are pooled), `method`, `baseline`
@@ -46,10 +46,10 @@ def rows_of(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     model = own | {"effects": facts.get("model/effects") or "none"}
     model["alone"] = facts.get(f"field/{shared['figure']}")
     name = str(facts.get("model/name", "?"))
-    rows = [shared | model | _of_method(name, under(facts, "test"), under(facts, "time"))]
+    rows = [shared | model | _of_method(name, facts_under(facts, "test"), facts_under(facts, "time"))]
     # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
-    every = ((name, under(facts, f"baseline/{name}")) for name in beside)
+    every = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
     rows += [dict.fromkeys(own) | shared | _of_method(name, its, its) for name, its in every]
     return [{**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows]
 

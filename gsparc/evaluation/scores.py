@@ -83,7 +83,7 @@ class Scores:
         return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
 
 
-def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
+def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
     """Rows of the subset `train`, `val` or `test`.
 
     Raises:
@@ -106,7 +106,7 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
 
 
-def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
+def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
     """Return what predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
 
     A run has a phase of its own, which nothing tells of one that was not learned from.
@@ -124,7 +124,9 @@ def best_phases(method: Method, data: Measurements, rows: np.ndarray, runs: np.n
     return turn
 
 
-def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test") -> Scores:
+def score_methods(
+    methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test"
+) -> Scores:
     """Predict the chosen rows of every fold with that fold's method.
 
     Channels of runs that it did not learn from are scored after the best common phase of each.
@@ -140,14 +142,14 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     """
     if len(methods) != len(split.folds):
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
-    every = [rows_of(fold, eval_on) for fold in split.folds]
+    every = [rows_to_score(fold, eval_on) for fold in split.folds]
     confidence: list[np.ndarray] = []
     variance: list[np.ndarray] = []
     samples = []
     for method, rows, fold in zip(methods, every, split.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
-        turn = best_phases(method, data, rows, runs) if len(runs) else None
+        turn = best_phase_of_runs(method, data, rows, runs) if len(runs) else None
         metric = metrics_for(data.site.scored, data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
         order = []

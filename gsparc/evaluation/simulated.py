@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import bounded, draw_stations, draw_walls, legend_below
-from gsparc.evaluation.summary import table
+from gsparc.evaluation.from_above import draw_stations, draw_walls, legend_below, set_bounds
+from gsparc.evaluation.table import Table
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
@@ -19,7 +18,7 @@ from gsparc.simulate.scenes.shipped import list_shipped_scenes
 CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
-def floor_plan(outcome: Outcome, path: Path) -> None:
+def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     """Draw from above: received power, delay spread and, after `auto`, where a dropped effect mattered.
 
     Of several transmitters, the strongest at each place.
@@ -55,7 +54,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         left, right, south, north = axis.axis()
         if len(triangles):
             draw_walls(axis, triangles)
-        bounded(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
+        set_bounds(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects
     figure.suptitle(f"{outcome.dataset.data.site.name}: {len(places)} receivers\n{outcome.effects}")
     save(figure, path)
@@ -69,7 +68,7 @@ def _map(
     axis.figure.colorbar(dots, ax=axis, location="bottom", label=label, shrink=0.8)
 
 
-def shipped_scenes() -> Table:
+def table_of_scenes() -> Table:
     """Return size, triangles and materials of every scene that comes with Sionna."""
     rows = []
     for name in list_shipped_scenes():
@@ -78,4 +77,4 @@ def shipped_scenes() -> Table:
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(tracer.triangles()):,}", used])
     heads = ["scene", "size [m]", "triangles", "materials"]
-    return table("scene=NAME: scenes that come with Sionna", heads, [], rows)
+    return Table.of_texts("scene=NAME: scenes that come with Sionna", heads, [], rows)

@@ -22,7 +22,7 @@ from gsparc.data.checks.outliers import find_outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, find_outlier_rows
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import OUTLINE, annotate, bounded, draw_stations, framed, legend_below
+from gsparc.evaluation.from_above import OUTLINE, annotate, draw_stations, frame_of, legend_below, set_bounds
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -52,7 +52,7 @@ class Spots:
     suspicious: np.ndarray
 
 
-def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
+def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     """Places of the moving end (of the receiver where both move), the levels there and what looks wrong."""
     site = data.site
     of_row = data.moving[:, -3:]
@@ -110,11 +110,11 @@ def draw_site(
 
     `levels` are the `link_levels` of powers, `steps` their `plausibility.find_level_steps`.
     """
-    places = spots(data, levels)
-    points = [places.place[~places.far], still_ends(data)]  # but those far outside
+    places = find_spots(data, levels)
+    points = [places.place[~places.far], static_positions(data)]  # but those far outside
     if data.site.static_end is None:
         points.append(data.tx[:, :2] + data.site.origin[:2])
-    low, high = framed(np.concatenate(points))
+    low, high = frame_of(np.concatenate(points))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
     jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
@@ -152,7 +152,7 @@ def _title(data: Measurements, places: Spots) -> str:
     return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
 
 
-def still_ends(data: Measurements) -> np.ndarray:
+def static_positions(data: Measurements) -> np.ndarray:
     """World x and y (T, 2) of the ends that stand still, where that is known."""
     site = data.site
     if site.stations is not None:
@@ -191,7 +191,7 @@ def _draw_map(
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
         axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
-    bounded(axis, low, high, **_labels(data))
+    set_bounds(axis, low, high, **_labels(data))
     _draw_stations(axis, data, jumping)
     _draw_suspicious(axis, places, low, high)
 
@@ -204,7 +204,7 @@ def _size(place: np.ndarray, extent: float) -> float:
 
 
 def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> None:
-    place, site = still_ends(data), data.site
+    place, site = static_positions(data), data.site
     if not len(place):
         return
     what = "transmitter" if site.static_end == "tx" else "receiver"

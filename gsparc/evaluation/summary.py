@@ -6,8 +6,9 @@ import csv
 import json
 import math
 import platform
+import re
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -16,16 +17,16 @@ from typing import Any
 from uuid import uuid4
 
 import numpy as np
-from rich.table import Table
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.metric_formats import DECIDING, TABLES, form_of, score_of
+from gsparc.evaluation.metric_formats import CALIBRATION, DECIDING, TABLES, form_of, score_of
+from gsparc.evaluation.table import P50, TRAIN, Column, Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 WITH_SILENT = "rmse_db_with_silent"
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
-TRAIN_S = "train s/fold"  # head of every table: the mean over folds, each of which trains a model
+MOST_LEARNED = 3  # notes of a fit below the table; the log has all
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -83,62 +84,31 @@ def program_version(origin: Mapping[str, str | None]) -> str:
     return f"gsparc {version('gsparc')}" + (f" at commit {commit[:8]}" if commit else "")
 
 
-def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str = "test") -> Table:
-    """`result_rows` as a table for a terminal; the last row is `method`'s."""
-    heads, rows = result_rows(facts, method, prefix)
-    result = table(title, heads[:1], heads[1:], rows)
-    result.rows[-1].style = "bold"
-    return result
-
-
-def result_rows(
-    facts: Mapping[str, Any], method: str, prefix: str = "test"
-) -> tuple[list[str], list[list[str]]]:
-    """Heads and cells: every method a row, accuracy beside its seconds and milliseconds.
+def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix: str = "test") -> Table:
+    """Return every method as a row, accuracy beside its seconds and milliseconds; the last row is `method`'s.
 
     Args:
         facts: flat facts as in `summary.json`.
         method: name of the row with `facts[prefix/...]`.
+        title: of the table.
         prefix: `test`, `train` or `val`.
     """
-    silent = [WITH_SILENT] if f"{prefix}/{WITH_SILENT}" in facts else []
-    wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], *silent, "skill")]
+    # Silent rows, and variances, are not of all data and methods.
+    beside = [name for name in (WITH_SILENT, CALIBRATION) if f"{prefix}/{name}" in facts]
+    wanted = [*TABLES[facts["dataset/kind"]], "skill", *beside]
     names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
     names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
     rows, own = [], [(method, prefix, "time")]
-    if f"field/{wanted[0][0]}" in facts:
+    if f"field/{wanted[0]}" in facts:
         own.insert(0, (f"{method}, Gaussians alone", "field", "field"))
     for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), *own]:
-        values = [facts.get(f"{figures}/{figure}") for figure, _ in wanted]
-        if name == method and times != "time" and values == [facts.get(f"{prefix}/{f}") for f, _ in wanted]:
+        values = [facts.get(f"{figures}/{figure}") for figure in wanted]
+        if name == method and times != "time" and values == [facts.get(f"{prefix}/{f}") for f in wanted]:
             continue  # fitted once: its row is the method's own
-        cells = [shown(value, form) for value, (_, form) in zip(values, wanted, strict=True)]
-        cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
-        rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *cells])
-    return ["method", *(name for name, _ in wanted), TRAIN_S, "query ms p50"], rows
-
-
-def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
-    result = Table(title=title)
-    for column in (*words, *numbers):
-        result.add_column(column, justify="left" if column in words else "right")
-    for row in rows:
-        result.add_row(*row)
-    return result
-
-
-def markdown_table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: bool = False) -> list[str]:
-    """Lines of a table in Markdown; `numbers`: all columns but the first are aligned right."""
-    heads = list(heads)
-    rule = "|---" + ("|---:" if numbers else "|---") * (len(heads) - 1) + "|"
-    lines = [f"| {' | '.join(cells)} |" for cells in (heads, *rows)]
-    return [lines[0], rule, *lines[1:]]
-
-
-def shown(value: float | None, form: str) -> str:
-    """Return a number in a format, or a dash where there is none or NaN."""
-    return "-" if value is None or math.isnan(value) else format(value, form)
+        costs = [facts.get(f"{times}/{key}") for key in ("train_s", "render_ms_p50")]
+        rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *values, *costs])
+    columns = [Column("method", ""), *(Column(name, form_of(name)) for name in wanted), TRAIN, P50]
+    return Table(title, columns, rows, bold=method)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -150,9 +120,19 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
-    if facts.get("model/made") not in (None, facts.get("model/label")):
-        cost.insert(0, f"{facts['model/label']}: {facts['model/made']}")
-    return [*seen.get(prefix, []), *run_conditions(facts), *rest, *cost]
+    lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
+    # The candidate's name, as stored summaries have it, is no word for users.
+    return [line.replace("joint_powers", "powers of all stations") for line in lines]
+
+
+def describe_model(facts: Mapping[str, Any]) -> list[str]:
+    """Return which method was chosen and what it is made of, then what it learned, of a law or of beams."""
+    made, label = facts.get("model/made"), facts.get("model/label")
+    # `ImageSources` is said as image sources.
+    kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
+    named = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
+    learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
+    return [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
@@ -235,7 +215,7 @@ def _cell(value: Any) -> Any:
     return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
 
 
-def git(folder: Path, *arguments: str) -> str | None:
+def run_git(folder: Path, *arguments: str) -> str | None:
     """Return what git says in a folder, None where it fails."""
     # `git status` would lock the index to refresh it, and a run that is killed then leaves the lock.
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
@@ -249,11 +229,11 @@ def git(folder: Path, *arguments: str) -> str | None:
 def _git() -> str | None:
     here = Path(__file__).resolve()
     # None in an installed copy inside someone else's tree.
-    if git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
+    if run_git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
         return None
-    commit = git(here.parent, "rev-parse", "HEAD")
+    commit = run_git(here.parent, "rev-parse", "HEAD")
     # Untracked files are mostly results of runs: with them every tree would count as edited.
-    edited = commit and git(here.parent, "status", "--porcelain", "--untracked-files=no")
+    edited = commit and run_git(here.parent, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}-dirty" if edited else commit
 
 

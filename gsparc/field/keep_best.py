@@ -71,7 +71,7 @@ class KeepBest(L.Callback):
         edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         log.info(
-            "gradient steps: %d taken, %s kept: later ones not significantly better on %d validation rows",
+            "gradient steps: %d taken, %s kept: later ones not significantly better on %d rows held out",
             taken, f"the first {self.step}" if self.step else "none", len(self.start),
         )  # fmt: skip
 

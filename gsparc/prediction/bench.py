@@ -43,7 +43,7 @@ class Case:
     reference: Call | None = None
 
 
-def model_of(count: int, projection: Projection, backend: str | None = None) -> GaussianModel:
+def random_model(count: int, projection: Projection, backend: str | None = None) -> GaussianModel:
     """Return a room of `count` Gaussians of all shapes, from nearly transparent to nearly opaque (seeded)."""
     site = Site(
         name="bench", kind="spectrum", static_end="tx", grid=GRID, array=None, carrier_hz=None,
@@ -65,9 +65,11 @@ def model_of(count: int, projection: Projection, backend: str | None = None) -> 
     return model
 
 
-def cases(count: int, projection: Projection) -> Iterator[Case]:
+def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
     """Yield the kernels of a field of N Gaussians, two real channels wide."""
-    means, quats, scales, opacities = (t.detach() for t in model_of(count, projection).gaussians.geometry())
+    means, quats, scales, opacities = (
+        t.detach() for t in random_model(count, projection).gaussians.geometry()
+    )
     geometry = means, quats, scales, opacities
     pose, draw = Pose.identity(torch.tensor([0.5, -0.5, 0.2])), torch.Generator().manual_seed(0)
     features = torch.rand(1, count, 2, generator=draw)
@@ -116,7 +118,7 @@ def cases(count: int, projection: Projection) -> Iterator[Case]:
 
 def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
     """What stands beside the rasterizer: networks of emission and the sum of a channel."""
-    emission = model_of(count, "tangent").emission
+    emission = random_model(count, "tangent").emission
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
     encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw))
     of = f"{count} x {BATCH}"
@@ -132,7 +134,7 @@ def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
     )  # fmt: skip
 
 
-def loss() -> Case:
+def loss_case() -> Case:
     """Return L1 and SSIM of a batch of spectra with their gradient."""
     draw = torch.Generator().manual_seed(0)
     target, shown = (torch.rand((BATCH, GRID.height, GRID.width), generator=draw) for _ in range(2))
@@ -150,9 +152,9 @@ def loss() -> Case:
                 gradient(convolved))  # fmt: skip
 
 
-def step(projection: Projection, count: int = STEPPED) -> Case:
+def training_step_case(projection: Projection, count: int = STEPPED) -> Case:
     """Return a training step: emission, plan, blending, loss, gradients and Adam."""
-    ours, plain = (_learning(model_of(count, projection, backend)) for backend in (None, "reference"))
+    ours, plain = (_learning(random_model(count, projection, backend)) for backend in (None, "reference"))
     return Case("training step", f"{count} {projection} x {BATCH}", ours, plain)
 
 

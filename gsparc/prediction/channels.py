@@ -20,23 +20,23 @@ REGULARISED = 1e-4
 SUBCARRIERS_PER_BLOCK = 12
 
 
-def centred(middle_hz: float, spacing_hz: float, count: int) -> np.ndarray:
+def centred_grid(middle_hz: float, spacing_hz: float, count: int) -> np.ndarray:
     """Return frequencies (count,) [Hz] of a grid about `middle_hz`.
 
-    >>> centred(100.0, 10.0, 4).tolist()
+    >>> centred_grid(100.0, 10.0, 4).tolist()
     [85.0, 95.0, 105.0, 115.0]
     """
     return middle_hz + (np.arange(count) - (count - 1) / 2) * spacing_hz
 
 
-def interpolated(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -> Tensor:
+def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -> Tensor:
     """Return channels (..., K) at tones (K,) [Hz] as (..., W) at other frequencies of the same band.
 
     The best linear interpolation of channels whose delays fill `WINDOW_S` evenly about their mean; a single
     tone is repeated.
 
-    >>> tones = centred(2.4e9, 1e6, 16)
-    >>> between = interpolated(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
+    >>> tones = centred_grid(2.4e9, 1e6, 16)
+    >>> between = interpolate_tones(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
     >>> between.shape, bool((between[0, 5:10] - 1).abs().max() < 0.05)  # of a channel without delay
     (torch.Size([1, 15]), True)
 
@@ -126,7 +126,7 @@ class Paths:
         return (np.stack(summed, axis=-1) * self.reference_hz / tones).astype(np.complex64)
 
 
-def judged(method: Method, site: Site, uplink: Any) -> Prediction:
+def predict_from_uplink(method: Method, site: Site, uplink: Any) -> Prediction:
     """Return channels of the measured tones in stored units with what else is said of them; see `_heard`."""
     return method.predict(_heard(method, site, uplink))
 
@@ -156,7 +156,7 @@ def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())
 
 
-def placed_paths(method: Method, site: Site, query: Query) -> Paths:
+def paths_at(method: Method, site: Site, query: Query) -> Paths:
     """Return the paths of a coherent field at positions in local coordinates.
 
     Of several solutions that are averaged these are those of each that is made of paths, by its weight.
@@ -173,7 +173,7 @@ def placed_paths(method: Method, site: Site, query: Query) -> Paths:
     return Paths((gain * site.target_scale).numpy(), delay.numpy(), carrier_hz, direction=direction.numpy())
 
 
-def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
+def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
     """Return channels (B, A, K) at other frequencies, and with `symbols` as `resource_grid` does.
 
     Raises:
@@ -189,7 +189,7 @@ def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None)
                 f"frequency_hz=: {site.name} was measured at {tone / 1e6:.3f} MHz alone and tells "
                 "nothing of others; where a field is made of sources, .paths(...) has their gains and delays"
             )
-        channel = interpolated(channel, site.subcarriers_hz, wanted)
+        channel = interpolate_tones(channel, site.subcarriers_hz, wanted)
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
 
 

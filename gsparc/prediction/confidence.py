@@ -19,8 +19,8 @@ from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
 from gsparc.models.method import Method, Prediction, answered, predictions
 from gsparc.models.target_rows import training_targets
-from gsparc.prediction.query import Queries, returned
-from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, joined
+from gsparc.prediction.query import Queries, match_input
+from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, join_evidence
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, restored, stored
@@ -28,18 +28,18 @@ from gsparc.processes.stored import Stored, restored, stored
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
 
-def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+def gather_evidence(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Return what `method` predicts of rows, and the rivals of its confidence."""
-    evidence = joined(
+    evidence = join_evidence(
         [
-            Evidence(rows[chosen], data.moving[rows[chosen]], *judged(said, batch.target))
+            Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
             for chosen, batch, said in predictions(method, data, rows)
         ]
     )
-    return replace(evidence, scores=evidence.scores | rivals(data, fold, evidence.row))
+    return replace(evidence, scores=evidence.scores | rival_scores(data, fold, evidence.row))
 
 
-def judged(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state.
 
     `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
@@ -62,7 +62,7 @@ def expected_score(prediction: Prediction) -> Tensor | None:
     return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
-def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
+def rival_scores(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Return the confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
     known, kernel = known_positions(data, fold), position_kernel(data, fold)
     return {kind: rival_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
@@ -170,23 +170,23 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
     return 1 / (1 - np.minimum(score, 0))
 
 
-def keep(path: str | Path, trusted: Trusted) -> None:
+def store_trusted(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
     checkpoint.amend(path, {KEY: stored(trusted)})
 
 
-def trusted_of(extra: Mapping[str, Any]) -> Trusted:
+def read_trusted(extra: Mapping[str, Any]) -> Trusted:
     """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
     return restored(extra[KEY]) if KEY in extra else Trusted()
 
 
-def threshold_of(kind: str, threshold: Threshold) -> float:
+def confidence_threshold(kind: str, threshold: Threshold) -> float:
     """Return a threshold of scores as one of confidences."""
     value = np.array(threshold.value)
     return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")
 
 
-class Judging:
+class ConfidenceMixin:
     """What a `Predictor` says of how good its answers are."""
 
     site: Site
@@ -209,7 +209,7 @@ class Judging:
         Raises:
             ValueError: the method has no confidence of that kind.
         """
-        return returned(*self._sure(tx, rx, uplink))
+        return match_input(*self._sure(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
@@ -233,7 +233,7 @@ class Judging:
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
         sure, single, as_torch = self._sure(tx, rx, uplink)
-        good = returned(sure >= self.trusted.threshold, single, as_torch)
+        good = match_input(sure >= self.trusted.threshold, single, as_torch)
         return bool(good) if single and not as_torch else good
 
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
@@ -241,7 +241,7 @@ class Judging:
         if uplink is not None:
             from gsparc.prediction import channels
 
-            sure = self._confidence(channels.judged(self.method, self.site, uplink), None)
+            sure = self._confidence(channels.predict_from_uplink(self.method, self.site, uplink), None)
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self.queries.query(tx, rx)

@@ -15,7 +15,7 @@ from gsparc.ops.transforms import carries_tangent, mapped, transforming
 from gsparc.prediction.query import Queries
 
 
-def followed(
+def predict_with_gradients(
     method: Method, queries: Queries, tx: Any, rx: Any, prepared: list[Method]
 ) -> tuple[Prediction, torch.dtype, bool]:
     """Return moments in stored units, in float64, the precision of the positions, and whether one was given.

@@ -13,7 +13,7 @@ from gsparc.models.per_station import OfStation, PerStation
 from gsparc.prediction.query import Queries
 
 
-class Jointly:
+class JointMixin:
     """What a `Predictor` of powers says of several places or stations at once."""
 
     site: Site

@@ -17,9 +17,9 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.pareto import Point, Settings
 from gsparc.models.reduced import Measured, reduced
-from gsparc.prediction.confidence import trusted_of
+from gsparc.prediction.confidence import read_trusted
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import BLOCKS, interleaved
+from gsparc.prediction.timing import BLOCKS, time_interleaved
 from gsparc.processes.stored import Stored, restored, stored
 
 KEY = "operating"
@@ -46,7 +46,7 @@ class Operating(Stored):
     p50_ms: float
 
 
-def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -> None:
+def store_points(path: Path, points: Sequence[Point], figure: str, measured: Measured) -> None:
     """Store points in a checkpoint, replacing earlier ones; the file is rewritten whole or not at all."""
     found = [
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
@@ -68,7 +68,9 @@ QUANTILE = 0.75  # a point fits when three of four of its queries did: its media
 QUERIES = 16  # at places drawn in the scene's box
 
 
-def within(method: Method, stored: checkpoint.Stored, budget_ms: float) -> tuple[Method, Operating]:
+def choose_within_budget(
+    method: Method, stored: checkpoint.Stored, budget_ms: float
+) -> tuple[Method, Operating]:
     """Choose the most accurate stored operating point that takes at most `budget_ms` on this machine.
 
     Sets torch's number of threads to the point's.
@@ -90,7 +92,7 @@ def within(method: Method, stored: checkpoint.Stored, budget_ms: float) -> tuple
     ends = 2 if site.static_end is None else 1
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)
     calls = {i: Predictor(way, site).cycling(places) for i, way in enumerate(ways)}
-    times = interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
+    times = time_interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
     fitting = [i for i in here if here[i] <= budget_ms]
     if not fitting:
@@ -132,8 +134,8 @@ def load(
         ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence or unit.
     """
     method, stored = loading.load(path)
-    trusted = trusted_of(stored.extra)
+    trusted = read_trusted(stored.extra)
     if confidence is not None:
         trusted.check(confidence)
-    chosen, point = (method, None) if budget_ms is None else within(method, stored, budget_ms)
+    chosen, point = (method, None) if budget_ms is None else choose_within_budget(method, stored, budget_ms)
     return Predictor(chosen, stored.site, method, point, trusted, confidence, stored.extra, unit)

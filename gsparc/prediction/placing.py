@@ -18,7 +18,7 @@ MARGIN = 0.1  # of the largest side of the box of training places: what lies far
 SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3
 
 
-def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
+def fill_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
     """Put places without a height at the one at which that end was measured, with a note.
 
     Raises:
@@ -40,7 +40,7 @@ def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
     return replace(queries, ends=ends, notes=tuple(notes))
 
 
-def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
+def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     """Return world positions (n, 3) [m] by end of places with heights.
 
     Raises:
@@ -79,7 +79,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
 
-def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
+def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
     """Say that places which are `far` (n,) outside are so only in height; empty: they are not."""
     low, high = site.moving_box[:, 2::3] + site.origin[2]
     ends = [end for end in ("tx", "rx") if end in world]
@@ -95,7 +95,7 @@ def in_height(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
     return f", {abs(most):,.0f} m {side}, only in height: above the sea, or the ground?"
 
 
-def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
+def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
     """Say that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
     # Places that came in degrees were projected, and have no unit that can be mistaken.
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
@@ -108,7 +108,7 @@ def in_a_speck(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -
     return f"{here}: degrees or km as x and y?"
 
 
-def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
+def match_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Return row of the places and station (N,) int64 of each prediction; -1 without stations.
 
     Args:

@@ -20,10 +20,10 @@ from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians, Method, Prediction, answered
 from gsparc.models.per_station import PerStation, of_station
 from gsparc.physics.row_factors import freedom_words
-from gsparc.prediction.confidence import Judging, Trusted
-from gsparc.prediction.gradients import followed
-from gsparc.prediction.jointly import Jointly
-from gsparc.prediction.query import InDegrees, Queries, returned
+from gsparc.prediction.confidence import ConfidenceMixin, Trusted
+from gsparc.prediction.gradients import predict_with_gradients
+from gsparc.prediction.jointly import JointMixin
+from gsparc.prediction.query import DegreesMixin, Queries, match_input
 from gsparc.prediction.timing import Call
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from gsparc.prediction.operating_point import Operating
 
 
-class Predictor(InDegrees, Jointly, Judging):
+class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     """A fitted method in world coordinates.
 
     Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
@@ -170,6 +170,7 @@ class Predictor(InDegrees, Jointly, Judging):
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry, in the unit of the answers and float32.
 
+        Far from all data it is that of knowing nothing: about 1 of spectra, whose pixels are from 0 to 1.
         Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1) of other kinds.
 
         >>> predictor.std(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]]).shape  # [dB]
@@ -187,7 +188,7 @@ class Predictor(InDegrees, Jointly, Judging):
             spread = said.variance.sqrt().float()
             # As many axes as the answers have, so that both broadcast.
             spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
-            return returned(spread, single, as_torch)
+            return match_input(spread, single, as_torch)
 
         return self._of_stations(ask, tx, rx)
 
@@ -267,12 +268,12 @@ class Predictor(InDegrees, Jointly, Judging):
 
         if uplink is not None:
             channel = channels.uplink_channels(self.method, self.site, uplink, frequency_hz)
-            answer = channels.on_grid(channel, self.site, None, symbols)
+            answer = channels.to_resource_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
         channel = torch.as_tensor(self._ask("csi", tx, rx))
         # A single position comes back without its leading axis.
         channel = channel[None] if channel.ndim == 2 else channel
-        answer = channels.on_grid(channel, self.site, frequency_hz, symbols)
+        answer = channels.to_resource_grid(channel, self.site, frequency_hz, symbols)
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
@@ -286,7 +287,7 @@ class Predictor(InDegrees, Jointly, Judging):
 
         if uplink is not None:
             return channels.uplink_paths(self.method, self.site, uplink)
-        return channels.placed_paths(self._whole, self.site, self.queries.query(tx, rx).query)
+        return channels.paths_at(self._whole, self.site, self.queries.query(tx, rx).query)
 
     def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
         """Return the Gaussians that are rendered, in the world, with what they emit for these positions.
@@ -329,11 +330,11 @@ class Predictor(InDegrees, Jointly, Judging):
             moments, single = self._slopes(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return returned(_in_unit(answered(self.method, query), wanted).mean, single, as_torch)
+        return match_input(_in_unit(answered(self.method, query), wanted).mean, single, as_torch)
 
     def _slopes(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
-        moments, dtype, single = followed(method, self.queries, tx, rx, self._prepared)
+        moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx, self._prepared)
         said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
         unknown = None if said.unknown is None or not own else said.unknown.to(dtype)

@@ -135,7 +135,7 @@ def read_places(end: str, value: Any) -> np.ndarray:
     return array
 
 
-def returned(value: Tensor, single: bool, as_torch: bool) -> Any:
+def match_input(value: Tensor, single: bool, as_torch: bool) -> Any:
     """Return answers (B, ...) as they were asked for: of one place, as tensors or NumPy arrays."""
     value = value[0] if single else value
     if as_torch:
@@ -143,7 +143,7 @@ def returned(value: Tensor, single: bool, as_torch: bool) -> Any:
     return value.numpy() if value.ndim else float(value)
 
 
-class InDegrees:
+class DegreesMixin:
     """What a `Predictor` says of latitudes and longitudes."""
 
     site: Site

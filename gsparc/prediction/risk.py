@@ -4,7 +4,7 @@ Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-se
 tried from strict to lax, each is a binomial test on the calibration positions it accepts, and the first that
 fails ends the search. Given who is accepted the bad ones are binomial, so the promise is about the error
 *among accepted positions*; plain split conformal promises a share of all positions instead. Whether promises
-hold is told by `trials`: thresholds of many draws, tried on other rows.
+hold is told by `run_trials`: thresholds of many draws, tried on other rows.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Evidence:
         return len(self.row)
 
 
-def joined(parts: Sequence[Evidence]) -> Evidence:
+def join_evidence(parts: Sequence[Evidence]) -> Evidence:
     """Join folds; scores that not every part has are dropped."""
     kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
     scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
@@ -126,12 +126,12 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
     return float(interval.low), float(interval.high)
 
 
-def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
+def threshold_levels(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
     """Return thresholds (at most `count`,), strict to lax: quantiles of scores (n,) not the calibration's."""
     return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
 
 
-def choose(
+def choose_threshold(
     score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Guarantee,
     group: np.ndarray | None = None,
 ) -> Threshold:  # fmt: skip
@@ -143,7 +143,7 @@ def choose(
     could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
 
     >>> score = np.linspace(0, 1, 100)
-    >>> choose(score, score < 0.5, levels_of(score), Guarantee()).accepted >= 50  # all bad ones are unsure
+    >>> choose_threshold(score, score < 0.5, threshold_levels(score), Guarantee()).accepted >= 50
     True
     """
     threshold = Threshold(float("inf"), 0, 0)
@@ -188,7 +188,7 @@ def _tail(wrong: float, accepted: float, alpha: float) -> float:
     return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
 
 
-def bounded(relative_error: np.ndarray) -> np.ndarray:
+def bounded_loss(relative_error: np.ndarray) -> np.ndarray:
     """Return losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
     return np.minimum(relative_error, 1.0)
 
@@ -272,7 +272,7 @@ def split_evidence(
     Raises:
         ValueError: too few positions, or patches, for three parts.
     """
-    unit = np.arange(len(evidence)) if how == "random" else cells(evidence.position)
+    unit = np.arange(len(evidence)) if how == "random" else number_patches(evidence.position)
     order = rng.permutation(unit.max(initial=-1) + 1)
     first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
     if not 0 < first < second < len(order):
@@ -297,16 +297,18 @@ def too_few(count: int, promise: Guarantee) -> str | None:
     )
 
 
-def laxer(evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int) -> Guarantee | None:
+def relax_guarantee(
+    evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int
+) -> Guarantee | None:
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(promise, limit_db=float(limit))
-        if np.isfinite(accept(evidence, other, kind, spatial, seed)[1].value):
+        if np.isfinite(calibrate_threshold(evidence, other, kind, spatial, seed)[1].value):
             return other
     return None
 
 
-def cells(position: np.ndarray) -> np.ndarray:
+def number_patches(position: np.ndarray) -> np.ndarray:
     """Number the patch of the plane that each position (n, 3) lies in, (n,); on a plumb line, of it."""
     flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
@@ -315,14 +317,36 @@ def cells(position: np.ndarray) -> np.ndarray:
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
+def area_parts(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
+    """Return what each of n samples adds to the area under risk-coverage, (n,), whose mean is the area.
+
+    >>> score, loss = np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])
+    >>> bool(np.isclose(area_parts(score, loss).mean(), risk_coverage(score, loss).mean()))
+    True
+    """
+    # The sample at rank r is in the means of r, r + 1, ..., n samples; equal scores share their ranks.
+    weight = np.cumsum(1 / np.arange(len(score), 0, -1))[::-1]
+    order, group = np.argsort(-score, kind="stable"), np.unique(-score, return_inverse=True)[1]
+    shared = np.bincount(group[order], weight) / np.bincount(group)
+    return loss * shared[group]
+
+
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
-    """Return the confidence of the smallest area under risk-coverage on `rows`."""
+    """Return the confidence of the smallest area under risk-coverage on `rows`.
+
+    The first, mostly the model's own, stays where another gains no more than the paired standard error (the
+    one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
+    """
     # Bounded, so that a few fades do not decide which kind is the best.
-    loss = bounded(evidence.error[rows])
-    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).mean())
+    loss = bounded_loss(evidence.error[rows])
+    parts = {kind: area_parts(score[rows], loss) for kind, score in evidence.scores.items()}
+    own, best = next(iter(parts)), min(parts, key=lambda kind: parts[kind].mean())
+    gain = parts[own] - parts[best]
+    # Both are of the same rows: their difference scatters less than either.
+    return best if gain.mean() > gain.std() / np.sqrt(max(len(gain), 1)) else own
 
 
-def accept(
+def calibrate_threshold(
     evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int | list[int],
     apart_m: float = 0,
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:  # fmt: skip
@@ -340,12 +364,14 @@ def accept(
     if apart_m > 0:  # neighbours err together and count as one
         calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
-    patch = cells(evidence.position)[calibrate] if spatial else None
-    threshold = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    patch = number_patches(evidence.position)[calibrate] if spatial else None
+    threshold = choose_threshold(
+        score[calibrate], bad[calibrate], threshold_levels(score[choose_on]), promise, patch
+    )
     return used, threshold, test, choose_on
 
 
-def trials(
+def run_trials(
     evidence: Evidence, promise: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
     seed: int = 0,
 ) -> Trial:  # fmt: skip
@@ -363,7 +389,9 @@ def trials(
     realised, coverage, kinds = [], [], []
     bad = promise.bad(evidence.error)
     for draw in range(draws):
-        used, threshold, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
+        used, threshold, test, _ = calibrate_threshold(
+            evidence, promise, kind, how == "spatial", [seed, draw], apart_m
+        )
         accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)
@@ -372,9 +400,9 @@ def trials(
     return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
 
 
-def figures(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
+def calibration_facts(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
     """Return flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
-    loss = bounded(evidence.error)
+    loss = bounded_loss(evidence.error)
     perfect = risk_coverage(-loss, loss).mean()
     facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": float(perfect)}
     risks = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}

@@ -52,7 +52,7 @@ class ClockSettings:
 BLOCKS = ClockSettings(rounds=40, warmup=0, budget_s=60.0, calls=4, untimed=1)
 
 
-def interleaved(
+def time_interleaved(
     contenders: Mapping[Key, Call],
     settings: ClockSettings | None = None,
     threads: Mapping[Key, int] | None = None,
@@ -105,8 +105,8 @@ def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
     return times
 
 
-def cycling(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key, Call]:
-    """Return calls that answer one of `queries` each, another one every time."""
+def cycle_queries(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key, Call]:
+    """Return calls that answer one of `draw_queries` each, another one every time."""
 
     def call(method: Method) -> Call:
         return lambda turn: answered(method, queries[turn % len(queries)])
@@ -114,16 +114,16 @@ def cycling(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key
     return {name: call(method) for name, method in methods.items()}
 
 
-def percentiles(times: np.ndarray) -> tuple[float, float]:
+def median_and_p95(times: np.ndarray) -> tuple[float, float]:
     """Return median and 95th percentile of times (n,).
 
-    >>> percentiles(np.arange(101.0))
+    >>> median_and_p95(np.arange(101.0))
     (50.0, 95.0)
     """
     return float(np.median(times)), float(np.quantile(times, 0.95))
 
 
-def queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Query]:
+def draw_queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Query]:
     """Return batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
     picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images

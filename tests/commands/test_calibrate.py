@@ -8,29 +8,29 @@ import numpy as np
 import pytest
 from campaigns import brief, compose, plain, spectra
 
-from gsparc.commands.calibrate import tables
+from gsparc.commands.calibrate import calibration_tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
 from gsparc.evaluation import open_runs as command
-from gsparc.evaluation.open_runs import collect
+from gsparc.evaluation.open_runs import collect_evidence
 from gsparc.evaluation.pictures import draw_calibration
-from gsparc.prediction.confidence import gather
+from gsparc.prediction.confidence import gather_evidence
 from gsparc.prediction.risk import (
     Evidence,
     Guarantee,
     Threshold,
     Trial,
     best_kind,
-    bounded,
-    cells,
-    choose,
-    figures,
-    joined,
-    levels_of,
+    bounded_loss,
+    calibration_facts,
+    choose_threshold,
+    join_evidence,
+    number_patches,
     rank_correlation,
     risk_coverage,
+    run_trials,
     split_evidence,
-    trials,
+    threshold_levels,
 )
 from gsparc.training.context import FitContext
 
@@ -57,9 +57,21 @@ def test_risk_of_the_surest(score, risk) -> None:
     assert np.allclose(risk_coverage(np.array(score), np.array([0.0, 0.9, 0.3])), risk)
 
 
+def test_auto_chose_another_confidence_by_chance() -> None:
+    """Of thirteen rows the least area is mostly luck: a gain within the paired standard error is none."""
+    evidence = _evidence()
+    noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
+    alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
+    rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
+    chosen = [best_kind(replace(evidence, scores=alike), some) for some in rows]
+    assert chosen.count("learned") >= 18  # 12 of 20 had the least area
+    worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
+    assert best_kind(replace(evidence, scores=worse), np.arange(200)) == "expected"
+
+
 def test_knowing_the_errors_is_best() -> None:
     evidence = _evidence()
-    loss = bounded(evidence.error)
+    loss = bounded_loss(evidence.error)
     scores = evidence.scores | {"perfect": -loss}
     areas = {kind: risk_coverage(score, loss).mean() for kind, score in scores.items()}
     assert areas["perfect"] < areas["learned"] < 0.8 * areas["distance"]
@@ -72,16 +84,18 @@ def test_threshold_counts_the_bad_and_bounds_their_share() -> None:
     promise = Guarantee(alpha=0.1, delta=0.1)
     score = np.linspace(1, 0, 400)
     bad = np.arange(400) >= 200
-    found = choose(score, bad, levels_of(score), promise)
+    found = choose_threshold(score, bad, threshold_levels(score), promise)
     assert 180 <= found.accepted < 230 and found.bad == max(0, found.accepted - 200)
     assert found.bound(0.1) <= 0.1 + 1e-9
-    assert choose(score, np.ones(400, bool), levels_of(score), promise).value == float("inf")
+    assert choose_threshold(score, np.ones(400, bool), threshold_levels(score), promise).value == float("inf")
     assert Threshold(0.0, 0, 0).bound(0.1) == 1.0
 
 
 def test_too_few_to_test_promise_nothing() -> None:
     score = np.linspace(1, 0, 15)
-    found = choose(score, np.zeros(15, bool), levels_of(score), Guarantee(alpha=0.1, delta=0.1))
+    found = choose_threshold(
+        score, np.zeros(15, bool), threshold_levels(score), Guarantee(alpha=0.1, delta=0.1)
+    )
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
     with pytest.raises(ValueError, match="above 0 and below 1"):
         Guarantee(alpha=1.5)
@@ -91,29 +105,29 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
     run.stored = [SimpleNamespace(extra={})]
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
-    monkeypatch.setattr(command, "rows_of", lambda *_: None)
+    monkeypatch.setattr(command, "rows_to_score", lambda *_: None)
     for name in ("known_positions", "position_kernel"):
         monkeypatch.setattr(command.confidence, name, lambda *_: None)
     kept = []
-    monkeypatch.setattr(command.confidence, "keep", lambda *stored: kept.append(stored))
-    monkeypatch.setattr(command.confidence, "gather", lambda *_: evidence)
+    monkeypatch.setattr(command.confidence, "store_trusted", lambda *stored: kept.append(stored))
+    monkeypatch.setattr(command.confidence, "gather_evidence", lambda *_: evidence)
     how = "auto", False, 0
-    stored, said = command.store("", {}, {}, Guarantee(-40.0), *how)
+    stored, said = command.calibrate_and_store("", {}, {}, Guarantee(-40.0), *how)
     # A choice among confidences replaced the model's own though nothing was promised.
     assert "confidence stays the model's own, the checkpoint as it was; " in said and not kept
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
-    stored, said = command.store("", {}, {}, Guarantee(better), *how)
+    stored, said = command.calibrate_and_store("", {}, {}, Guarantee(better), *how)
     assert f"confidence={stored.kind}, before: the model's own; accepted from" in said and len(kept) == 1
-    assert "no threshold" in command.store("", {}, {}, Guarantee(better - 1), *how)[1]
+    assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better - 1), *how)[1]
     evidence.error[:] = 10.0
-    assert "no limit_db= up to 6 is kept" in command.store("", {}, {}, Guarantee(), *how)[1]
+    assert "no limit_db= up to 6 is kept" in command.calibrate_and_store("", {}, {}, Guarantee(), *how)[1]
 
 
 @pytest.mark.parametrize("how", ["random", "spatial"])
 def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
-    trial = trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how, 200)
+    trial = run_trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how, 200)
     facts = trial.facts()
     assert trial.kind == "learned" and trial.coverage.mean() > 0.2
     # Resampled from one pool: the share itself scatters by about 0.02.
@@ -141,9 +155,9 @@ def test_evidence_of_a_method(campaign, folds) -> None:
                         (Mean, {"distance", "gp_variance"})):  # fmt: skip
         method = make()
         method.fit(data, fold, FitContext())
-        found = gather(method, data, fold, fold.test)
+        found = gather_evidence(method, data, fold, fold.test)
         assert set(found.scores) == kinds and (found.scores["distance"] <= 0).all()
-    assert len(joined([found, found])) == 2 * len(fold.test)
+    assert len(join_evidence([found, found])) == 2 * len(fold.test)
 
 
 MUTE = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1)
@@ -179,15 +193,15 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
 def test_positions_on_a_plumb_line_have_patches() -> None:
     upright = _evidence(60)
     upright.position[:, :2] = 1.0
-    assert len(np.unique(cells(upright.position))) == 6
+    assert len(np.unique(number_patches(upright.position))) == 6
 
 
 def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
     """Predictions without any error: 0 / 0 ended the command."""
     exact = replace(_evidence(30), error=np.zeros(30))
-    facts = figures(exact, [], Guarantee())
+    facts = calibration_facts(exact, [], Guarantee())
     assert facts["confidence/learned/area_below_distance"] is None
-    assert tables(facts | {"dataset/name": "d", "model/name": "m"})[0].row_count == 2
+    assert len(calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[0].rows) == 2
 
 
 def _trained(folder, *more: str, run: str = "run"):
@@ -201,11 +215,11 @@ def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_pa
     often = "callbacks.checkpoint.interval=10"
     _, objects = train(compose(*brief(file, often)), tmp_path / "run")
     for path in (tmp_path / "run" / "last.ckpt", tmp_path / "run" / "refit" / "last.ckpt"):
-        assert len(collect([str(path)], {}, {})[0]) == len(objects.split.folds[0].test)
+        assert len(collect_evidence([str(path)], {}, {})[0]) == len(objects.split.folds[0].test)
         found, _, _ = evaluate_files([path], split={"redraw": True, "seed": 5})
         assert re.match(r"another split \(random\): [1-9]\d* of these 8 test", found.facts["split/foreign"])
         with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-            collect([str(path)], {}, {"name": "sparse"})
+            collect_evidence([str(path)], {}, {"name": "sparse"})
 
 
 def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(tmp_path) -> None:
@@ -232,28 +246,28 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
         with pytest.raises(
             ValueError, match=r": [1-9]\d* of these \d+ test rows are at places that were TRAINED"
         ):
-            collect([path], file, {})
+            collect_evidence([path], file, {})
             pytest.fail(name)
     elsewhere = written("elsewhere", every, 0.05)
-    assert len(collect([path], elsewhere, {})[0]) == len(objects.split.folds[0].test)
+    assert len(collect_evidence([path], elsewhere, {})[0]) == len(objects.split.folds[0].test)
     (tmp_path / "own.npz").unlink()
     with pytest.raises(
         ValueError, match=r"\(content hashes differ\); these test rows may have been TRAINED on"
     ):
-        collect([path], elsewhere, {})
+        collect_evidence([path], elsewhere, {})
 
 
 def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
     """With another split, or one whose file is gone, a threshold was chosen on rows that were fitted to."""
     objects = _trained(tmp_path)
     path, rows = str(objects.checkpoints[0]), len(objects.split.folds[0].test)
-    assert len(collect([path], {}, {})[0]) == rows
+    assert len(collect_evidence([path], {}, {})[0]) == rows
     with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-        collect([path], {}, {"name": "corner"})
+        collect_evidence([path], {}, {"name": "corner"})
     split = tmp_path / "run" / "split.json"
     path = str(_trained(tmp_path, "split=file", f"split.path={split}", run="other").checkpoints[0])
-    assert len(collect([path], {}, {})[0]) == rows
+    assert len(collect_evidence([path], {}, {})[0]) == rows
     other = split.rename(tmp_path / "kept.json")
-    assert collect([path], {}, {"path": str(other)})[1]["split/foreign"] is None  # by its hash
+    assert collect_evidence([path], {}, {"path": str(other)})[1]["split/foreign"] is None  # by its hash
     with pytest.raises(ValueError, match="another split; these test rows may have been TRAINED on"):
-        collect([path], {}, {"name": "corner"})
+        collect_evidence([path], {}, {"name": "corner"})

@@ -52,7 +52,7 @@ from gsparc.commands.shared import cli
 names = [command.name for command in COMMANDS.values() if command.configured]
 with initialize_config_module("gsparc.conf", version_base="1.3"):
     for name in names:
-        cli.overview("", name), compose(name)
+        cli.help_text("", name), compose(name)
     compose("train", ["model=splat", "model.field.count=3", "paper=gsrf"])
 sys.exit("torch" in sys.modules)
 """
@@ -161,7 +161,7 @@ def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeyp
 
 
 def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
-    monkeypatch.setattr("gsparc.commands.shared.cli.offer", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("gsparc.commands.shared.cli.offer_plugins", Mock(side_effect=KeyboardInterrupt))
     answer = gsparc("train", "dataset=rfid", "model=gsparc")
     assert (answer.status, answer.err) == (130, ["error: interrupted"])
 

@@ -17,8 +17,8 @@ from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
-from gsparc.evaluation.answers import predict
-from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.answers import predict_file
+from gsparc.evaluation.open_runs import align_to_site
 from gsparc.models import checkpoint
 from gsparc.models.per_station import for_stations
 from gsparc.models.registry import method_class
@@ -84,7 +84,7 @@ def answered(model, folder, heads, rows, **how):
     """Rows of the table of predictions at the rows of a table."""
     rows = rows.tolist() if isinstance(rows, np.ndarray) else rows
     count = len(list(folder.glob("*.csv")))
-    return read(predict(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"])
+    return read(predict_file(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"])
 
 
 def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
@@ -109,7 +109,7 @@ def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
 
 def test_every_station_of_every_place(town, tmp_path):
     place = walk()[:7] + np.array([0.5, 0, 0])
-    facts = predict(town, write_table(tmp_path / "a.csv", "xyz", place.tolist()))
+    facts = predict_file(town, write_table(tmp_path / "a.csv", "xyz", place.tolist()))
     found = read(facts["out"])
     assert [row["station"] for row in found] == NAMES.tolist() * 7
     assert column(found, "x").tolist() == np.repeat(place[:, 0], 3).tolist()
@@ -175,7 +175,7 @@ def test_stations_at_unknown_places(tmp_path):
     assert np.abs(found - powers(walk())[:4]).max() < 1
     turned = {"station_position": posts, "station_name": NAMES, "rssi_db": arrays["rssi_db"].T}
     back = stations(**{name: values[::-1] for name, values in turned.items()})
-    same = aligned(from_arrays(back | {"rssi_db": back["rssi_db"].T}), model.site)
+    same = align_to_site(from_arrays(back | {"rssi_db": back["rssi_db"].T}), model.site)
     assert [NAMES[t] for t in same.station[:3]] == ["mast", "roof-1", "roof-0"]
     data = from_arrays(arrays)
     rows = np.arange(len(data))
@@ -229,7 +229,7 @@ def test_watts_were_answered_in_decibels(tmp_path):
     heads = {None: ("rssi_W", watts), "mW": ("rssi_mW", 1e3 * watts)}
     heads |= {"dBm": ("rssi_db", level + 30), "dBW": ("rssi_db", level)}
     for unit, (head, wanted) in heads.items():
-        facts = predict(gsparc.load(tmp_path / "model.ckpt", unit=unit), file, overwrite=True)
+        facts = predict_file(gsparc.load(tmp_path / "model.ckpt", unit=unit), file, overwrite=True)
         found = read(facts["out"])
         assert list(found[0])[3:] == [head, f"{head}_std", "confidence"]
         assert facts["predict/unit"] == (unit or "W")
@@ -265,14 +265,14 @@ def test_tables_that_hold_no_places_are_refused(valley, tmp_path, name):
     text, said = BAD_TABLES[name]
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(DataError, match=said) as raised:
-        predict(valley, tmp_path / "a.csv")
+        predict_file(valley, tmp_path / "a.csv")
     assert "\n" not in str(raised.value) and not (tmp_path / "a.predicted.csv").exists()
 
 
 def test_degrees_where_the_model_knows_none(town, tmp_path):
     file = write_table(tmp_path / "a.csv", ["lat", "lon"], [[47, 11]])
     with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
-        predict(town, file)
+        predict_file(town, file)
 
 
 def test_where_the_answers_go(town, tmp_path):
@@ -284,34 +284,34 @@ def test_where_the_answers_go(town, tmp_path):
         ("b.csv", {}, "is there already; say overwrite=true"),
     ):
         with pytest.raises(DataError, match=message):
-            predict(town, file, tmp_path / out, **how)
+            predict_file(town, file, tmp_path / out, **how)
     assert (tmp_path / "b.csv").read_text() == "kept"
-    predict(town, file, tmp_path / "b.csv", overwrite=True)
+    predict_file(town, file, tmp_path / "b.csv", overwrite=True)
     assert len(read(tmp_path / "b.csv")) == 3
-    predict(town, file, tmp_path / "b.npz")
+    predict_file(town, file, tmp_path / "b.npz")
     with np.load(tmp_path / "b.npz") as stored:
         assert stored["station"].tolist() == NAMES.tolist() and stored["rssi_db"].shape == (3,)
     with pytest.raises(DataError, match=r"b\.npz: expected a name ending in \.csv, \.tsv"):
-        predict(town, tmp_path / "b.npz", tmp_path / "c.csv")
+        predict_file(town, tmp_path / "b.npz", tmp_path / "c.csv")
     with pytest.raises(DataError, match="no such file"):
-        predict(town, tmp_path / "absent.csv")
+        predict_file(town, tmp_path / "absent.csv")
 
 
 def test_places_far_outside_are_counted(town, tmp_path, caplog):
     file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [21, 5, 1.5], [5, 500, 1.5], [5, 5, 90]])
-    assert predict(town, file)["predict/far_outside"] == 2
+    assert predict_file(town, file)["predict/far_outside"] == 2
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
 
 def test_heights_above_the_sea_were_only_outside_the_box(town, tmp_path, caplog):
     file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1615.5], [5, 7, 1612]])
-    predict(town, file)
+    predict_file(town, file)
     assert "1,614 m above, only in height" in caplog.text
 
 
 def test_columns_of_a_users_own_were_left_out_of_the_predictions(town, tmp_path):
     (tmp_path / "a.csv").write_text("note,station,x,rssi_db,y,z\nwall,mast,1,-70,2,1.5\n,roof-0,3,,4,1.5\n")
-    predict(town, tmp_path / "a.csv")
+    predict_file(town, tmp_path / "a.csv")
     rows = read(tmp_path / "a.predicted.csv")
     heads = ["note", "station", "x", "rssi_db (given)", "y", "z", "rssi_db"]
     assert list(rows[0])[:7] == heads and rows[0]["note"] == "wall" and rows[0]["rssi_db (given)"] == "-70"
@@ -321,7 +321,7 @@ def test_columns_of_a_users_own_were_left_out_of_the_predictions(town, tmp_path)
 def test_stations_of_several_columns_are_asked_as_they_were_learned(tmp_path, names, found):
     model = fitted(stations(station_name=np.array(names)), tmp_path)
     (tmp_path / "a.csv").write_text("x,y,z,PCI,EARFCN\n2,3,1.5,7,2\n")
-    predict(model, tmp_path / "a.csv")
+    predict_file(model, tmp_path / "a.csv")
     assert read(tmp_path / "a.predicted.csv")[0]["station"] == found
 
 
@@ -363,8 +363,8 @@ def test_what_is_no_table_goes_to_an_npz(tmp_path, kind):
     model = fitted({"tx_position": walk(), "rx_position": POSTS[0], **arrays}, tmp_path, "mean")
     file = write_table(tmp_path / "a.csv", "xyz", walk()[:3].tolist())
     with pytest.raises(DataError, match=message):
-        predict(model, file)
-    predict(model, file, tmp_path / "a.npz")
+        predict_file(model, file)
+    predict_file(model, file, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as stored:
         assert stored[kind].shape == (3, *arrays[kind].shape[1:])
         assert np.allclose(stored[kind], arrays[kind].mean(0), atol=1e-5)

@@ -13,13 +13,13 @@ from towns import town_model
 
 import gsparc
 from gsparc.commands.tradeoff import task
-from gsparc.evaluation.experiment.tradeoff import Recorded, closeness, irreducible
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.experiment.tradeoff import RecordingView, closeness_db, why_irreducible
+from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
 from gsparc.models.pareto import Point
 from gsparc.prediction import operating_point
-from gsparc.prediction.timing import ClockSettings, interleaved
+from gsparc.prediction.timing import ClockSettings, time_interleaved
 from gsparc.training import tracking
 
 
@@ -50,7 +50,7 @@ def swept(field, tmp_path_factory):
 def test_dashboards_get_the_points_that_nothing_beats(swept):
     facts, _, _, said = swept
     ((loggers, name, heads, rows),) = said
-    assert (loggers, name, heads[:2]) == (1, "operating points", ["point", "ms p50"])
+    assert (loggers, name, heads[:2]) == (1, "operating points", ["not beaten", "ms p50"])
     assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
 
 
@@ -91,19 +91,19 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
     assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
     data = field.data
     blind = dataclasses.replace(data, target=np.zeros_like(data.target))
-    recorded = [Recorded(field.methods[0]) for _ in range(2)]
+    recorded = [RecordingView(field.methods[0]) for _ in range(2)]
     for one, seen in zip(recorded, (blind, data), strict=True):
-        score([one], seen, field.split)
+        score_methods([one], seen, field.split)
     answers, again = (torch.cat(one.means) for one in recorded)
-    assert torch.equal(answers, again) and closeness(answers, answers) == 100.0
-    assert closeness(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
+    assert torch.equal(answers, again) and closeness_db(answers, answers) == 100.0
+    assert closeness_db(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
 
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
     points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
-    monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
+    monkeypatch.setattr(operating_point, "time_interleaved", lambda calls, clock, threads: pretended)
     best = max(points, key=lambda p: p.score)
     assert gsparc.load(ckpt, budget_ms=1e6).point == best
     assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]
@@ -117,7 +117,7 @@ def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
     predictor = gsparc.load(ckpt, budget_ms=1000)
     place = predictor.site.origin + 0.1
     assert predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
-    times = interleaved({0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1})
+    times = time_interleaved({0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1})
     assert np.median(times[0]) <= 1000
     torch.set_num_threads(threads)
 
@@ -138,15 +138,15 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     )
     point = Point("as trained", {}, 1, {"psnr_db": 1.0}, 1.0, np.ones(3))
     with pytest.raises(KeyboardInterrupt):
-        operating_point.keep(ckpt, [point], "psnr_db", {})
+        operating_point.store_points(ckpt, [point], "psnr_db", {})
     assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]
 
 
 def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
     whole = gsparc.load(town_model())
     method, single = whole.method, whole.at("west").method
-    assert "of several stations is asked as it was trained" in irreducible(method)[0]
-    assert "no Gaussians, sources" in irreducible(DistanceLaw())[0] and not irreducible(single)
+    assert "of several stations is asked as it was trained" in why_irreducible(method)[0]
+    assert "no Gaussians, sources" in why_irreducible(DistanceLaw())[0] and not why_irreducible(single)
 
 
 def test_a_model_of_several_stations_could_not_be_timed():

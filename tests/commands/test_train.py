@@ -19,7 +19,7 @@ from omegaconf import open_dict
 import gsparc
 from gsparc.commands import evaluate
 from gsparc.commands.train import Objects, main, train
-from gsparc.evaluation.console import one_line
+from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment import options
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
@@ -85,7 +85,7 @@ def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, 
         train(short(spectra_file), tmp_path)
     text = (ROOT / "ARCHITECTURE.md").read_text().partition("Calls down to the Trainer: ")[2]
     named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
-    assert ["task", "once", "_train_and_show", *called] == named
+    assert ["task", "run_once", "_train_and_show", *called] == named
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):
@@ -197,7 +197,7 @@ def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monke
     with pytest.raises(Exception, match="TensorBoard is not installed") as error:
         train(compose(*brief(spectra_file), "logger=tensorboard", *folders), tmp_path)
     message = "logger=tensorboard: TensorBoard is not installed; say pip install"
-    assert one_line(error.value).startswith(message)
+    assert error_in_one_line(error.value).startswith(message)
 
 
 def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monkeypatch, caplog):

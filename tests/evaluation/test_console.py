@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.console import Screen, one_line, warned_again
+from gsparc.evaluation.console import ConsoleHandler, error_in_one_line, repeated_warnings
 
 
 @pytest.mark.parametrize(
@@ -23,12 +23,27 @@ from gsparc.evaluation.console import Screen, one_line, warned_again
     ],
 )
 def test_an_error_is_one_line(error, line):
-    assert one_line(error) == line
+    assert error_in_one_line(error) == line
+
+
+def test_evaluate_said_how_every_column_is_read():
+    """28 lines of columns, of the file and of the one that was learned from, stood before its table."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        node = compose("evaluate", overrides=["ckpt=x"], return_hydra_config=True).hydra.job_logging
+    screen = ConsoleHandler(node.handlers.console.quiet, io.StringIO())
+    said = [logging.LogRecord("gsparc.data.datasets.own", level, "", 0, "x", (), None) for level in (20, 30)]
+    assert [screen.filter(one) for one in said] == [False, True]
+
+
+def test_a_setting_of_a_launcher_that_was_not_chosen_had_no_hint():
+    with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
+        compose("train", overrides=["hydra.launcher.n_jobs=2"])
+    assert error_in_one_line(error.value).endswith("say hydra/launcher=joblib, too, or ray")
 
 
 def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
     """A default run of a city filled five screens: notes of each station, sixty warnings of a kind."""
-    screen = Screen(["gsparc.models"], io.StringIO())
+    screen = ConsoleHandler(["gsparc.models"], io.StringIO())
     monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
     caplog.set_level(logging.INFO)
     for station in range(12):
@@ -41,7 +56,7 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
         "warning: 5 s are too few", "warning: data/a.npz: no level of station s0",
         "warning: data/a.npz: 3 places were measured twice", "fitting",
     ]  # fmt: skip
-    assert warned_again() == [
+    assert repeated_warnings() == [
         "warnings that came again: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
     ]
 

@@ -7,7 +7,7 @@ import pytest
 from campaigns import compose
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from gsparc.evaluation.drawing import GREY, METHODS, PALETTE, look
+from gsparc.evaluation.drawing import GREY, METHODS, PALETTE, style_of
 
 # Linear RGB as seen without cones for red, green or blue (Machado, Oliveira and Fernandes 2009, severity 1).
 VISION = {
@@ -40,7 +40,7 @@ def test_four_methods_of_a_comparison_shared_one_colour():
     methods = compose(config="compare").methods
     for kind in ("spectrum", "csi", "rssi"):
         names = [name for name, one in methods.items() if kind in one.get("kinds", [kind])]
-        looks = {name: look(name) for name in names}
+        looks = {name: style_of(name) for name in names}
         assert len(set(looks.values())) == len(names), kind
         plain = [one for name, one in looks.items() if not name.endswith("_together")]
         assert max(Counter((one.colour, one.second) for one in plain).values()) == 1, kind
@@ -48,4 +48,4 @@ def test_four_methods_of_a_comparison_shared_one_colour():
 
 def test_methods_of_others_have_marks_of_their_own():
     ours = {one.mark for one in METHODS.values()}
-    assert not {look(f"plugin{number}").mark for number in range(50)} & ours
+    assert not {style_of(f"plugin{number}").mark for number in range(50)} & ours

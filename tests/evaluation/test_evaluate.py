@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.baselines import BASELINES, baseline
+from gsparc.evaluation.baselines import BASELINES, fit_baseline
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.scores import score
-from gsparc.evaluation.summary import decided_by_a_row, result_rows, write_samples, write_summary
+from gsparc.evaluation.scores import score_methods
+from gsparc.evaluation.summary import decided_by_a_row, results_table, write_samples, write_summary
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.method import Method, Prediction
@@ -77,9 +77,9 @@ def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monke
     facts = evaluate(methods, seconds, data, split, clock=QUICK, baselines=names, shared="idw").facts
     assert facts["baseline/idw/rmse_db"] == facts["test/rmse_db"]
     assert facts["baseline/idw/train_s"] == facts["time/train_s"]
-    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw"]
+    assert [row[0] for row in results_table(facts, "idw").rows] == ["mean", "idw"]
     facts["baseline/idw/rmse_db"] += 1  # fitted otherwise, a row of its own
-    assert [row[0] for row in result_rows(facts, "idw")[1]] == ["mean", "idw (baseline)", "idw"]
+    assert [row[0] for row in results_table(facts, "idw").rows] == ["mean", "idw (baseline)", "idw"]
 
 
 def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
@@ -91,16 +91,16 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     squares = [facts[f"{one}/rmse_db"] ** 2 for one in ("test", "baseline/nearest")]
     assert facts["test/skill"] == pytest.approx(1 - squares[0] / squares[1])
     assert not any("decided_by" in key for key in facts) and not decided_by_a_row(facts)
-    heads, _ = result_rows(facts, "idw")
+    heads, _ = results_table(facts, "idw").texts()
     assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
 
 
 def test_folds_are_pooled(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 45), folds(45, 5)
     methods, seconds = fit_all(Mean, data, split)
-    scores = score(methods, data, split)
+    scores = score_methods(methods, data, split)
     assert sorted(scores.row) == list(range(45)) and list(np.unique(scores.fold)) == [0, 1, 2, 3, 4]
-    first = score(methods[:1], data, dataclasses.replace(split, folds=split.folds[:1]))
+    first = score_methods(methods[:1], data, dataclasses.replace(split, folds=split.folds[:1]))
     assert np.array_equal(scores.samples["ssim"][:9], first.samples["ssim"])
     facts = evaluate(methods, seconds, data, split, baselines=("nearest", "gp"), clock=QUICK).facts
     assert facts["test/ssim"] == pytest.approx(scores.samples["ssim"].mean())
@@ -123,9 +123,9 @@ def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
 def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, name):
     data, split = campaign("csi", 40), folds(40)
     for subset in ("test", "val"):
-        assert baseline(name, data, split, subset).scores.figures()["nmse"] > 0.001
-    assert baseline(name, data, split, "test").methods[0].size() == 30
-    assert baseline(name, data, split, "val").methods[0].size() == 27
+        assert fit_baseline(name, data, split, subset).scores.figures()["nmse"] > 0.001
+    assert fit_baseline(name, data, split, "test").methods[0].size() == 30
+    assert fit_baseline(name, data, split, "val").methods[0].size() == 27
 
 
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.intervals import levels, power_intervals, with_silent
+from gsparc.evaluation.intervals import (
+    power_intervals,
+    reduced_chi_squared,
+    rmse_with_silent,
+    sensitivity_levels,
+)
 from gsparc.evaluation.scores import Scores
 
 COUNT, LEVEL = 4000, -80.0
@@ -35,7 +40,7 @@ def scored(data, mean_db, spread_db):
 
 
 def test_the_level_is_that_of_the_file(drawn):
-    assert levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
+    assert sensitivity_levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
 
 
 def test_a_true_law_is_calibrated(drawn):
@@ -53,6 +58,24 @@ def test_too_sure_and_too_unsure_are_told_apart(drawn):
     sure, right, unsure = (power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0))
     assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
     assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
+    # Heard rows are the upper part of their laws: a little less than 1.
+    assert 0.7 < right["reduced_chi2"] < 1.1 and sure["reduced_chi2"] == pytest.approx(
+        36 * right["reduced_chi2"]
+    )
+
+
+def test_whether_std_is_right_was_in_no_table():
+    """Deviations half as large as the errors, or twice, read the same in every table."""
+    rng = np.random.default_rng(0)
+    data = from_arrays({"rx_position": rng.uniform(0, 9, (COUNT, 3)), "tx_position": np.zeros(3),
+                        "csi": np.ones((COUNT, 1, 1), complex), "frequency_hz": 1e9})  # fmt: skip
+    samples = {"mse": rng.exponential(2.0, COUNT)}  # |e|^2 of complex normal errors
+    variance = np.where(np.arange(COUNT) % 100, 2.0, np.nan) / data.site.target_scale**2
+    own = Scores("csi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), variance)
+    assert reduced_chi_squared(own, data)["reduced_chi2"] == pytest.approx(1, abs=0.05)
+    small = replace(own, variance=variance / 4)
+    assert reduced_chi_squared(small, data)["reduced_chi2"] == pytest.approx(4, abs=0.2)
+    assert reduced_chi_squared(replace(own, variance=np.full(COUNT, np.nan)), data) == {}
 
 
 def test_silent_rows_counted_nowhere(drawn):
@@ -65,14 +88,14 @@ def test_silent_rows_counted_nowhere(drawn):
     )
     squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
     both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
-    found = [with_silent(one, data)["rmse_db_with_silent"] for one in both]
+    found = [rmse_with_silent(one, data)["rmse_db_with_silent"] for one in both]
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
 
 
 def test_levels_of_lists_are_none_of_a_station(drawn):
     """The last list's level was taken for the sensitivity of a station."""
     data = replace(drawn[0], target=drawn[0].target * np.linspace(1, 2, COUNT, dtype=np.float32)[:, None])
-    assert np.isnan(levels(data)).all()
+    assert np.isnan(sensitivity_levels(data)).all()
 
 
 def test_no_variance_no_figures(drawn):
@@ -95,7 +118,7 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     mean = data.target[row, 0].astype(float) * data.site.target_scale
     spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
     scores = Scores("rssi", 0 * row, row, {"prediction": mean}, np.full(len(row), np.nan), spread)
-    assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db"}
+    assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db", "reduced_chi2"}
 
 
 def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_decibels(drawn):
@@ -104,4 +127,4 @@ def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_d
     silent = replace(data, censored=side)
     one = scored(silent, np.full(COUNT, -np.inf), 6.0)
     one = replace(one, samples={**one.samples, "error_db": np.zeros(COUNT)})
-    assert with_silent(one, silent)["rmse_db_with_silent"] < 200
+    assert rmse_with_silent(one, silent)["rmse_db_with_silent"] < 200

@@ -11,9 +11,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables.read import understand_table
-from gsparc.evaluation.baselines import baseline
-from gsparc.evaluation.open_runs import Opened, aligned, open_files
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.baselines import fit_baseline
+from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
+from gsparc.evaluation.scores import score_methods
 from gsparc.models.per_station import for_stations
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
@@ -38,10 +38,10 @@ def test_stations_in_another_order_were_answered_by_each_other(chosen):
     data, other = town(), town(chosen)
     method = for_stations(method_class("idw")(), data)
     method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
-    same = aligned(other, data.site)
+    same = align_to_site(other, data.site)
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
     split = make_split(same.moving, SplitSettings(), place=same.place)
-    assert score([method], same, split).figures()["rmse_db"] < 4
+    assert score_methods([method], same, split).figures()["rmse_db"] < 4
 
 
 @pytest.mark.parametrize(("model", "unit", "power"), [("dBm", "W", -3), ("dBW", "mW", 0)])
@@ -57,22 +57,22 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
     data = from_arrays(given, {"level_unit": model})
     table = understand_table(tmp_path / "drive.csv").raw
     other = from_arrays({**table.arrays, "tx_position": POSTS[0]}, table.attributes)
-    same = aligned(other, data.site)
+    same = align_to_site(other, data.site)
     np.testing.assert_allclose(same.target, data.target, rtol=1e-5)
     assert (same.site.level_unit, same.site.target_scale) == (model, data.site.target_scale)
 
 
 def test_a_station_that_the_model_does_not_know_is_refused():
     with pytest.raises(ValueError, match="station roof of arrays is none of the model's"):
-        aligned(town(), town((0, 1)).site)
+        align_to_site(town(), town((0, 1)).site)
     alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
     with pytest.raises(ValueError, match="arrays has one static end, the model has stations"):
-        aligned(alone, replace(town().site, name="arrays"))
+        align_to_site(alone, replace(town().site, name="arrays"))
 
 
 def test_stations_at_one_place_are_known_by_their_names():
     mast = {"station_position": POSTS[[0, 0, 0]]}
-    same = aligned(town((1, 2, 0), **mast), town(**mast).site)
+    same = align_to_site(town((1, 2, 0), **mast), town(**mast).site)
     np.testing.assert_array_equal(same.station[:3], [1, 2, 0])
 
 
@@ -87,7 +87,7 @@ def test_degrees_about_another_origin_were_taken_for_the_same_metres():
 
     whole, part = drive(slice(None)), drive(slice(50, None))
     assert whole.site.georeference != part.site.georeference
-    same = aligned(part, whole.site)
+    same = align_to_site(part, whole.site)
     np.testing.assert_allclose(same.rx_position, whole.rx_position[50:], atol=1e-3)
     assert same.site.georeference == whole.site.georeference
 
@@ -107,9 +107,9 @@ def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():
     """A cache told data apart by their content, not by the numbers that a model has for their stations."""
     other = town((2, 0, 1))
     split = make_split(other.moving, SplitSettings(), place=other.place)
-    for data in (other, aligned(other, town().site)):
-        assert baseline("idw", data, split).scores.figures()["rmse_db"] < 4
-    found = baseline("idw", aligned(other, town().site), split, "train")
+    for data in (other, align_to_site(other, town().site)):
+        assert fit_baseline("idw", data, split).scores.figures()["rmse_db"] < 4
+    found = fit_baseline("idw", align_to_site(other, town().site), split, "train")
     assert found.scores.figures()["rmse_db"] < 1e-3
 
 
@@ -129,7 +129,7 @@ def test_data_centred_elsewhere_are_moved_not_misread(room):
         site, origin=site.origin + shift, static_position=site.static_position - shift,
         target_scale=site.target_scale * 4,
     )  # fmt: skip
-    back = aligned(
+    back = align_to_site(
         replace(
             room, site=there, tx=room.tx - shift, rx_position=room.rx_position - shift, target=room.target / 4
         ),
@@ -137,7 +137,7 @@ def test_data_centred_elsewhere_are_moved_not_misread(room):
     )
     assert np.allclose(back.moving, room.moving) and np.allclose(back.target, room.target)
     assert np.allclose(back.tx, room.tx) and np.array_equal(back.site.origin, site.origin)
-    assert aligned(room, site) is room
+    assert align_to_site(room, site) is room
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_data_centred_elsewhere_are_moved_not_misread(room):
 def test_data_of_another_place_or_kind_are_refused(room, name, change, message):
     other = replace(room, site=replace(room.site, **{name: change(getattr(room.site, name))}))
     with pytest.raises(ValueError, match=message):
-        aligned(other, room.site)
+        align_to_site(other, room.site)
 
 
 def test_what_is_in_target_units_is_converted_with_the_target(room):
@@ -158,7 +158,7 @@ def test_what_is_in_target_units_is_converted_with_the_target(room):
     heard = np.full((len(room), 2, 3), 1 + 1j, np.complex64)
     noise = np.full(len(room), 0.5, np.float32)
     louder = replace(room.site, target_scale=room.site.target_scale * 4)
-    back = aligned(
+    back = align_to_site(
         replace(room, site=louder, target=room.target / 4, uplink=heard / 4, noise_variance=noise / 16),
         room.site,
     )

@@ -11,7 +11,7 @@ from gsparc.data.checks.plausibility import find_level_steps, link_levels
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan
-from gsparc.evaluation.site_plan import draw_site, spots
+from gsparc.evaluation.site_plan import draw_site, find_spots
 
 REAL = {
     "techtile": "techtile-csi-920mhz", "powder": "powder-rss-462mhz", "ble": "ble-hall-1",
@@ -48,7 +48,7 @@ def test_levels_are_means_over_what_was_heard():
     level = np.stack([np.full(10, -60.0), np.full(10, -80.0), np.full(10, -70.0)], axis=1)
     level[3, 0], level[4, :2] = np.nan, np.nan
     data = from_arrays({"rx_position": place, "station_position": scattered(3), "rssi_db": level})
-    found = spots(data, link_levels(data))
+    found = find_spots(data, link_levels(data))
     assert np.allclose(found.place, place[:, :2])  # world coordinates, in the order of measuring
     expected = np.full(10, -70.0)
     expected[3] = -75
@@ -68,7 +68,7 @@ def test_levels_in_dbm_were_drawn_as_db(figures):
 def test_channels_are_means_of_power():
     csi = np.ones((20, 2, 3)) * np.array([1.0, 3.0])[:, None]
     arrays = {"rx_position": scattered(20), "tx_position": np.zeros(3), "csi": csi * (1 + 0j)}
-    found = spots(from_arrays({**arrays, "frequency_hz": 1e9 + 1e6 * np.arange(3)}), None)
+    found = find_spots(from_arrays({**arrays, "frequency_hz": 1e9 + 1e6 * np.arange(3)}), None)
     assert np.allclose(found.level_db, 10 * np.log10(5), atol=1e-4)
 
 
@@ -78,7 +78,7 @@ def test_rows_that_are_wrong_are_marked(figures):
     level = -20 * np.log10(np.linalg.norm(place - [3, 3, 5], axis=1))
     level[40] = -150
     data = from_arrays({"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level})
-    found = spots(data, link_levels(data))
+    found = find_spots(data, link_levels(data))
     assert np.flatnonzero(found.far).tolist() == [17] and found.suspicious[40]
     figure, said = shown(data, figures)
     assert "row 17 at (5000, 300)" in said and "row 40" in said and "suspicious level (1 place)" in said

@@ -15,11 +15,11 @@ from rich.console import Console
 
 import gsparc.evaluation.summary
 from gsparc.evaluation.summary import (
-    git,
     program_version,
     provenance,
     remarks,
     results_table,
+    run_git,
     write_samples,
     write_summary,
 )
@@ -66,6 +66,9 @@ def test_table_shows_no_accuracy_without_its_time():
     assert [row[0] for row in cells] == ["zero", "gp", "gsparc"]
     assert cells[2] == ["gsparc", "30.00", "-", "0.9123", "-", "-", "123", "1.25"]
     assert cells[1][-2:] == ["0.5", "2.5"]
+    facts |= {"test/reduced_chi2": 1.061, "baseline/gp/reduced_chi2": 3.0}
+    heads, rows = results_table(facts, "gsparc").texts()
+    assert dict(zip(heads, rows[-1], strict=True))["reduced_chi2"] == "1.06" and "3.00" in rows[1]
 
 
 def test_commit_is_known_inside_the_tree_only(tmp_path):
@@ -87,7 +90,7 @@ def test_a_killed_run_left_a_lock_in_the_repository(tmp_path):
     index = tmp_path / ".git" / "index"
     os.utime(file, (1, 1))
     before = index.read_bytes()
-    assert git(tmp_path, "status", "--porcelain") == "A  file"
+    assert run_git(tmp_path, "status", "--porcelain") == "A  file"
     assert index.read_bytes() == before
 
 
@@ -102,6 +105,18 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     quiet["baseline/gp/psnr_db"] = 29.0
     assert remarks(quiet) == []
     assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]
+
+
+@pytest.mark.parametrize(("kind", "made", "learned", "said"), [
+    ("ImageSources", "rays in closed form", None, ["gsparc: image sources: rays in closed form"]),
+    ("ArrayProcess", "array process through 9", None, ["gsparc: array process through 9"]),
+    ("Powers", "joint_powers in closed form", None, ["gsparc: powers of all stations in closed form"]),
+    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
+     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c"]),
+])  # fmt: skip
+def test_the_console_never_said_which_method_was_chosen(kind, made, learned, said):
+    facts = {"dataset/kind": "csi", "model/label": "gsparc", "model/class": kind, "model/made": made}
+    assert remarks({**facts, "model/learned": learned}) == said
 
 
 @pytest.mark.parametrize("prefix", ["train", "val"])

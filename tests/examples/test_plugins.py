@@ -14,12 +14,12 @@ from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
-from gsparc.commands.shared.plugins import offer
+from gsparc.commands.shared.plugins import offer_plugins
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
-from gsparc.evaluation.console import one_line
-from gsparc.evaluation.experiment.cells import plugged
+from gsparc.evaluation.console import error_in_one_line
+from gsparc.evaluation.experiment.cells import plugin_contenders
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 
@@ -41,7 +41,7 @@ def installed(tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(str(project))
         monkeypatch.syspath_prepend(str(info.parent))
         importlib.invalidate_caches()
-        offer()
+        offer_plugins()
 
     monkeypatch.setattr(ConfigStore.instance(), "repo", {**ConfigStore.instance().repo})
     for group in ("model", "dataset"):
@@ -61,7 +61,7 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     predictor = gsparc.load(objects.checkpoints[0])  # its class is out of a file, and of a plugin: trusted
     assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
     assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
-    assert plugged()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    assert plugin_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
     again, *_ = evaluate_files([objects.checkpoints[0]])
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
 
@@ -71,7 +71,7 @@ def test_a_plugin_was_no_nearest_name(installed):
     installed(EXAMPLES / "own-method")
     with pytest.raises(MissingConfigException) as error:
         compose("model=nearest_kk")
-    assert one_line(error.value) == "model=nearest_kk: no such choice; did you mean 'nearest_k'?"
+    assert error_in_one_line(error.value) == "model=nearest_kk: no such choice; did you mean 'nearest_k'?"
 
 
 def test_a_method_that_could_not_answer_once_stored_was_trained(installed):

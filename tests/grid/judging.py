@@ -12,8 +12,8 @@ from worlds import World, arrays
 
 from gsparc.commands.train import Objects, train
 from gsparc.data.schema import Kind, Measurements
-from gsparc.evaluation.baselines import baseline, fitting
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.baselines import baselines_for, fit_baseline
+from gsparc.evaluation.scores import score_methods
 
 BEHIND = 1.05  # times the best plain method's error that ours may have
 FRESH = 5  # seeds that repeat a miss
@@ -80,8 +80,11 @@ def run(world: World, seed: int, folder: Path, more: tuple[str, ...] = ()) -> tu
     found.plain = gaussians == 0 and facts["model/effects"] == "residual"
     found.model = f"{facts['model/effects']} from {facts['model/init']}, {gaussians} Gaussians"
     kind = data.site.kind
-    own = _losses(kind, score(objects.methods, data, split).samples)
-    plain = {name: _losses(kind, baseline(name, data, split).scores.samples) for name in fitting(data, split)}
+    own = _losses(kind, score_methods(objects.methods, data, split).samples)
+    plain = {
+        name: _losses(kind, fit_baseline(name, data, split).scores.samples)
+        for name in baselines_for(data, split)
+    }
     told = np.isfinite(own)
     means = {name: float(each[told].mean()) for name, each in plain.items()}
     found.errors = {name: _figure(kind, mean) for name, mean in means.items()}

@@ -9,7 +9,7 @@ import pytest
 from gsparc.data.checks.coherence import set_freedom
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
-from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.open_runs import align_to_site
 from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align, with_common_phase
 from gsparc.models.gsparc import Gsparc
@@ -110,7 +110,7 @@ def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
 
 def test_another_file_is_scored_after_the_freedom_of_the_model(logged):
     few = logged.subset(np.arange(8), replace(logged.site, freedom="none"))
-    assert aligned(few, logged.site).site.freedom == "phase+delay"
+    assert align_to_site(few, logged.site).site.freedom == "phase+delay"
 
 
 def test_packets_of_one_place_are_averaged(logged):

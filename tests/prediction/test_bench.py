@@ -8,7 +8,7 @@ from campaigns import compose
 
 from gsparc.commands import bench
 from gsparc.prediction import bench as timed
-from gsparc.prediction.bench import cases, loss, step
+from gsparc.prediction.bench import kernel_cases, loss_case, training_step_case
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +19,7 @@ def few(monkeypatch):
 
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_kernels_compute_what_their_references_do(projection):
-    for case in [*cases(30, projection), loss(), step(projection, count=5)]:
+    for case in [*kernel_cases(30, projection), loss_case(), training_step_case(projection, count=5)]:
         kernel, reference = case.kernel(), case.reference()
         if case.name == "plan":
             assert torch.equal(kernel.visible, reference.visible)
@@ -32,7 +32,9 @@ def test_kernels_compute_what_their_references_do(projection):
 
 def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "run_directory", lambda: tmp_path)
-    monkeypatch.setattr(bench, "step", lambda projection: step(projection, count=5))
+    monkeypatch.setattr(
+        bench, "training_step_case", lambda projection: training_step_case(projection, count=5)
+    )
     bench.task(compose("counts=[20]", "projections=[tangent]", "rounds=2", "budget_s=0", config="bench"))
     facts = json.loads((tmp_path / "summary.json").read_text())
     seconds = {name: value for name, value in facts.items() if name.startswith("bench/")}

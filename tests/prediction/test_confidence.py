@@ -11,10 +11,10 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.confidence import (
     Trusted,
     as_confidence,
-    gather,
-    keep,
+    gather_evidence,
     known_positions,
     position_kernel,
+    store_trusted,
 )
 from gsparc.prediction.risk import Guarantee
 from gsparc.training.context import FitContext
@@ -33,8 +33,8 @@ def site(campaign, folds, tmp_path):
 def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     data, fold, file = site
     method, _ = loading.load(file)
-    evidence = gather(method, data, fold, fold.test)
-    keep(
+    evidence = gather_evidence(method, data, fold, fold.test)
+    store_trusted(
         file, Trusted("distance", 0.2, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
     )
     world = data.tx[fold.test] + data.site.origin
@@ -57,7 +57,9 @@ def test_what_was_never_stored_is_said(site) -> None:
         gsparc.load(file, confidence="distance")
     with pytest.raises(ValueError, match="expected one of learned"):
         gsparc.load(file, confidence="hope")
-    keep(file, Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold)))
+    store_trusted(
+        file, Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
+    )
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
         gsparc.load(file, confidence="distance").accepts(tx=world)
 
@@ -68,6 +70,6 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
     data, fold, file = site
     known, kernel = known_positions(data, fold), replace(position_kernel(data, fold), noise=0.5)
     laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
-    keep(file, Trusted(kind, float(laxest), Guarantee(), known, kernel))
+    store_trusted(file, Trusted(kind, float(laxest), Guarantee(), known, kernel))
     near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()

@@ -20,7 +20,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.data.schema import LIGHT
-from gsparc.evaluation.simulated import floor_plan
+from gsparc.evaluation.simulated import draw_floor_plan
 from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate.assembly import SECONDS, assemble, join_shards, shard_arrays
@@ -210,7 +210,7 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     assert data.site.stations.name == ("a", "b") and data.site.static_end == "tx"
     learn, test = (set(data.place[rows]) for rows in data.release_split)
     assert not learn & test
-    floor_plan(outcome, tmp_path / "plan.png")
+    draw_floor_plan(outcome, tmp_path / "plan.png")
 
 
 def test_walk_has_times(tmp_path):
@@ -265,7 +265,7 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     assert "requirement met" in describe_choice(choice) and choice_table(choice).row_count == len(
         choice.table
     )
-    floor_plan(outcome, tmp_path / "picture.png")
+    draw_floor_plan(outcome, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 

@@ -17,8 +17,8 @@ from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
 from gsparc.physics.row_factors import alignment_factors
-from gsparc.prediction.channels import interpolated
-from gsparc.prediction.confidence import judged, rivals
+from gsparc.prediction.channels import interpolate_tones
+from gsparc.prediction.confidence import errors_and_scores, rival_scores
 from gsparc.prediction.risk import Evidence
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def predict_channels(
         else:
             answer = method.predict(batch)
             # The variance stays that of measured tones: interpolation is smooth between them.
-            mean = interpolated(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
+            mean = interpolate_tones(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
             answer = Prediction(mean, answer.variance, answer.unknown)
         none = torch.full((len(batch),), torch.nan)
         variance, confidence = (none if x is None else x for x in (answer.variance, answer.confidence))
@@ -93,13 +93,13 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
     if data.site.name == "argos-sim" and data.uplink is not None:
         return _of_streets(data, rows, frequency_hz), "rays"
     measured = data.targets(rows)
-    return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
+    return interpolate_tones(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
 
 
 def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
-    error, own = judged(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
-    return Evidence(rows, data.moving[rows], error, own | rivals(data, fold, rows))
+    error, own = errors_and_scores(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
+    return Evidence(rows, data.moving[rows], error, own | rival_scores(data, fold, rows))
 
 
 @lru_cache(maxsize=1)

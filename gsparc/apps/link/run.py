@@ -15,8 +15,8 @@ from gsparc.apps.link.adaptation import Rates
 from gsparc.apps.link.channels import band_evidence, predict_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.evaluation.open_runs import Opened
-from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred
-from gsparc.prediction.risk import Guarantee, accept
+from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid
+from gsparc.prediction.risk import Guarantee, calibrate_threshold
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,12 @@ class LinkStudy:
         self.spacing_hz = 1e3 * self.shape["spacing_khz"]
         self.one = slice(self.antenna, self.antenna + 1)
         # The PUSCH grid around the measured band's middle, whatever tones were measured.
-        frequency_hz = centred(float(self.tones.mean()), self.spacing_hz, self.count)
+        frequency_hz = centred_grid(float(self.tones.mean()), self.spacing_hz, self.count)
         grid = predict_channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
         evidence = band_evidence(grid, self.data, self.fold, self.fold.test)
         promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
-        kind, threshold, self.test, aside = accept(evidence, promise, *how)
+        kind, threshold, self.test, aside = calibrate_threshold(evidence, promise, *how)
         scores = evidence.scores[kind]
         self.score = scores[self.test]
         self.accepted = self.score >= threshold.value

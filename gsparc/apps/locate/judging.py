@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.apps.locate import locator as locating
 from gsparc.apps.locate.cells import Cells, cover_box
@@ -28,9 +27,10 @@ from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, aligned, open_files
-from gsparc.evaluation.scores import rows_of
-from gsparc.evaluation.summary import table, write_samples
+from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
+from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.table import Table
 from gsparc.prediction.predictor import keep
 
 log = logging.getLogger(__name__)
@@ -108,7 +108,7 @@ def report(
         facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
-    shown = [table(title, ["method"], ["median [m]", "p90 [m]"], rows)]
+    shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
     if result.inside is None:
         return facts, shown, []
@@ -184,7 +184,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
-        heard = group_snapshots(run.data, rows_of(run.split.folds[0], config.eval_on))
+        heard = group_snapshots(run.data, rows_to_score(run.split.folds[0], config.eval_on))
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays
@@ -193,7 +193,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
-        other = aligned(interpret_and_log(raw, config.data), site)
+        other = align_to_site(interpret_and_log(raw, config.data), site)
         heard = group_snapshots(other, np.arange(len(other)))
     return heard.at(sample_rows(config, len(heard))), placed
 

@@ -206,7 +206,7 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
-    from_above.bounded(axis, (left, low), (right, high), title=title)
+    from_above.set_bounds(axis, (left, low), (right, high), title=title)
     draw_measured_and_stations(axis, field)
     from_above.scale_bar(axis)
     if field.refused.any():
@@ -289,7 +289,7 @@ def draw_measurement_plan(
         image = np.full(batch.grid.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
-        from_above.bounded(axis, (left, low), (right, high), ylabel="", title=title)
+        from_above.set_bounds(axis, (left, low), (right, high), ylabel="", title=title)
         from_above.scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
@@ -316,7 +316,7 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     from_above.draw_stations(axis, placing.stations)
     from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
-    from_above.bounded(axis, (left, low), (right, high))
+    from_above.set_bounds(axis, (left, low), (right, high))
     from_above.scale_bar(axis)
     from_above.legend_below(figure)
     save(figure, path, 100)

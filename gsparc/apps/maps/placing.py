@@ -22,7 +22,7 @@ from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.data.tables import is_table
-from gsparc.prediction.placing import in_world
+from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -208,7 +208,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         asked = read_query_places(sites, (end,))
         where = asked.ends[end]
         above = np.full(len(asked), height) if where.height is None else where.height
-        return in_world(replace(asked, ends={end: replace(where, height=above)}), site)[end]
+        return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end]
     if sites is not None:
         every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:

@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.apps.maps import levels
 from gsparc.apps.maps.making import choose_stations
 from gsparc.data.schema import End, Measurements, Site
-from gsparc.evaluation.open_runs import aligned, open_files
+from gsparc.evaluation.open_runs import align_to_site, open_files
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 
@@ -145,7 +145,7 @@ def open_model(
         notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
     predictor = predictor.in_levels(unit)
     site = predictor.site
-    data = None if data is None else aligned(data, site)
+    data = None if data is None else align_to_site(data, site)
     names, missing = choose_stations(predictor, None if station is None else [station], key="station")
     for note in missing:
         log.warning(note)

@@ -22,11 +22,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gsparc.commands.shared.plugins import offer, offer_scenes
-from gsparc.commands.shared.run_lock import InUse, release
+from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
+from gsparc.commands.shared.run_lock import InUse, release_folders
 from gsparc.data.files import check_yaml
 from gsparc.data.instantiate import GROUPS, plugins
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, one_line
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, error_in_one_line
 from gsparc.models import registry
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
@@ -51,7 +51,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         task: called with the composed configuration.
         config: name of the primary configuration.
     """
-    offer()
+    offer_plugins()
     if config == "simulate":
         offer_scenes()
     if config == "train" and any(word.startswith("ckpt_path=") for word in sys.argv):
@@ -88,7 +88,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.exit(130 if interrupted or interrupts else 1)
     finally:
         logging.raiseExceptions = True
-        release()
+        release_folders()
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
@@ -159,11 +159,11 @@ def _message_of(error: BaseException) -> str:
         return "interrupted"
     if type(error).__module__.startswith(LAUNCHERS):
         advice = "what is done is kept, the same command goes on with the rest"
-        return f"a job was lost ({one_line(error)}); {advice}"
-    return one_line(error)
+        return f"a job was lost ({error_in_one_line(error)}); {advice}"
+    return error_in_one_line(error)
 
 
-def overview(answers: str, config: str) -> str:
+def help_text(answers: str, config: str) -> str:
     """Return what `--help` says: what it `answers`, settings with comments, choices of groups.
 
     Read from files: Hydra's own list of all values has no comments.

@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from rich.console import RenderableType
 
-from gsparc.evaluation.console import open_console, warned_again
+from gsparc.evaluation.console import open_console, repeated_warnings
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
@@ -27,25 +27,27 @@ def in_multirun() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def show(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
+def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
     """Show what a command ends with: tables, sentences, and `before` with where everything was written."""
     console = open_console()
     for one in tables:
         console.print(one)
     # Hydra opens a log for every job; one without a line is not worth a word.
     log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
-    for line in (*warned_again(), *lines, f"{before}written to {run_dir}{log}"):
+    for line in (*repeated_warnings(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
 
 
-def finish(run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **how: Any) -> dict[str, Any]:
-    """Write `summary.json` with the program and the machine, then `show`; returns the facts.
+def finish_run(
+    run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **how: Any
+) -> dict[str, Any]:
+    """Write `summary.json` with the program and the machine, then `show_result`; returns the facts.
 
     Of the machine, what `facts` says of it stands.
     """
     whole = {**machine_facts(), **facts, **provenance()}
     write_summary(run_dir / "summary.json", whole)
-    show(run_dir, *tables, **how)
+    show_result(run_dir, *tables, **how)
     return whole
 
 

@@ -13,7 +13,7 @@ from gsparc.data.instantiate import GROUPS, config_node, plugins
 from gsparc.simulate.scenes.shipped import list_shipped_scenes, shipped_scene_settings
 
 
-def offer() -> None:
+def offer_plugins() -> None:
     """Make every plugin a choice of its config group, with its settings and their defaults.
 
     One that cannot be imported is warned of and left out.

@@ -27,19 +27,21 @@ class InUse(BaseException):
 
 
 class RunLock(Callback):
-    """Hydra calls it before the folder of a run or a multirun is written to; `release` ends it."""
+    """Hydra calls it before the folder of a run or a multirun is written to; `release_folders` ends it."""
 
     def on_run_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the run's folder, in which an earlier summary would be that of other files."""
         folder = _folder(config, "hydra.run.dir")
-        hold(folder)
+        hold_folder(folder)
         if config.hydra.output_subdir is not None:  # it writes there
-            set_aside(folder, SUMMARY)
+            # A log is appended to: of a new training it is a new one.
+            anew = "ckpt_path" in config and not config.ckpt_path
+            set_aside(folder, SUMMARY, *["*.log"] * anew)
 
     def on_multirun_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the multirun's folder, and with it those of its jobs."""
         folder = _folder(config, "hydra.sweep.dir")
-        hold(folder, jobs=True)
+        hold_folder(folder, jobs=True)
         set_aside(folder, SUMMARY)
 
 
@@ -48,8 +50,8 @@ def _folder(config: DictConfig, key: str) -> Path:
     return Path(str(OmegaConf.select(config, key)))
 
 
-def hold(folder: Path, jobs: bool = False) -> None:
-    """Lock a folder until `release`; the system does so too when the process ends, however it ends.
+def hold_folder(folder: Path, jobs: bool = False) -> None:
+    """Lock a folder until `release_folders`; the system does so too when the process ends, however it ends.
 
     Args:
         folder: made where there is none.
@@ -109,7 +111,7 @@ def _lock(folder: Path, setting: str = "hydra.run.dir", holder: str = "") -> Fil
     raise InUse(f"{folder}: {why} give another {setting}=...")
 
 
-def release() -> None:
+def release_folders() -> None:
     """Unlock what this process holds."""
     while _locks:
         lock = _locks.pop()

@@ -24,6 +24,7 @@ class Contender:
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
+        networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
         only_longest: too slow for any but the longest budget.
     """
 
@@ -33,13 +34,15 @@ class Contender:
     kinds: tuple[str, ...] = ()
     stations: bool = False
     scene: bool = False
+    networks: bool = True
     only_longest: bool = False
 
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
         kind = not self.kinds or problem.kind in self.kinds
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
-        return kind and problem.stations >= self.stations and problem.scene >= self.scene
+        needs = problem.stations >= self.stations and problem.scene >= self.scene
+        return kind and needs and self.networks >= problem.network
 
     def overrides(self, budget_s: float | None) -> list[str]:
         """Overrides of train.yaml, but for the seed."""
@@ -68,7 +71,7 @@ class Cell:
         return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
 
 
-def plugged() -> dict[str, Contender]:
+def plugin_contenders() -> dict[str, Contender]:
     """Methods that are plugins; a class may name the `kinds` of data that it serves."""
     found = {}
     for name, path in plugins("model").items():
@@ -94,7 +97,7 @@ class Budget:
     splits: tuple[str, ...] = ()
 
 
-def plan(
+def plan_cells(
     problems: Sequence[Problem],
     methods: Mapping[str, Contender],
     budgets: Sequence[Budget],

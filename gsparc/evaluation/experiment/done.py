@@ -24,7 +24,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.summary import git, read_summary
+from gsparc.evaluation.summary import read_summary, run_git
 from gsparc.models.fitting import LAST, leaves
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ class State:
         files: SHA-256 of the files that settings name, by these; those of the data are in `data`.
         data: SHA-256 of the measurements, whatever files they were read from; "" without any.
         split: SHA-256 of the folds.
-        program: see `program`.
+        program: see `program_hash`.
     """
 
     settings: dict[str, Any]
@@ -63,7 +63,7 @@ class State:
 
     @classmethod
     def of(cls, config: DictConfig, data: str = "", split: str = "") -> State:
-        """Return the state of a resolved configuration on data (`content`) under a split (its hash)."""
+        """Return the state of a resolved configuration, of hashes of measurements and of their split."""
         kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
         named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
@@ -72,7 +72,7 @@ class State:
         if os.path.isdir(root := files.get("dataset.root", "")):
             inside = [str(file.relative_to(root)) for file in Path(root).rglob("*")]
             found["dataset.root"] = _of_files(Path(root), inside)
-        return cls(json.loads(json.dumps(named, default=str)), found, data, split, program(whole))
+        return cls(json.loads(json.dumps(named, default=str)), found, data, split, program_hash(whole))
 
     @classmethod
     def unread(cls, config: DictConfig) -> State | None:
@@ -87,7 +87,7 @@ class State:
         return all(record.get(name) == getattr(self, name) for name in names)
 
 
-def content(data: Measurements) -> str:
+def measurements_hash(data: Measurements) -> str:
     """Return the SHA-256 of all that a method can learn from, of every file that was read."""
     arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
     arrays |= {f"release {i}": rows for i, rows in enumerate(data.release_split or ())}
@@ -95,7 +95,7 @@ def content(data: Measurements) -> str:
     return sha256(repr(whole).encode()).hexdigest()
 
 
-def finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
     """Return the summary of a cell that is done; None where it is not.
 
     Args:
@@ -110,7 +110,7 @@ def finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] 
     return read_summary(folder / SUMMARY) if same else None
 
 
-def once(
+def run_once(
     folder: Path,
     state: State,
     work: Callable[[str | None], object],
@@ -127,13 +127,13 @@ def once(
         work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
             interrupted try has left, None to begin anew.
         unread: the same state, by which it is found done before its data are read.
-        reuse: see `finished`.
+        reuse: see `read_finished`.
         again: one that is done is done anew.
 
     Raises:
         DataError: the work has left no summary.
     """
-    facts = None if again else finished(folder, state, reuse)
+    facts = None if again else read_finished(folder, state, reuse)
     if facts is not None:
         log.info("%s: already done", folder)
         return facts
@@ -154,7 +154,7 @@ def once(
     return facts
 
 
-def program(settings: Any) -> str:
+def program_hash(settings: Any) -> str:
     """Return the hash of the text of gsparc and of every other package that settings name classes of."""
     named = {str(path).partition(".")[0] for path in iterate_targets(settings)}
     return _program(tuple(sorted({"gsparc", *named} - LIBRARIES)))
@@ -164,11 +164,11 @@ def program(settings: Any) -> str:
 def _program(packages: tuple[str, ...]) -> str:
     digest = sha256()
     for package in packages:
-        digest.update(f"{package} {text_of(package)};".encode())
+        digest.update(f"{package} {package_hash(package)};".encode())
     return digest.hexdigest()[:12]
 
 
-def text_of(package: str) -> str:
+def package_hash(package: str) -> str:
     """Return the hash of a package's text.
 
     In a checkout it is of what git tracks and of new files, as they are: commits that change pages, tests,
@@ -192,12 +192,12 @@ def text_of(package: str) -> str:
     return _of_files(folder, [str(file.relative_to(folder)) for file in folder.rglob("*.py")])
 
 
-def code_of(text: str) -> str:
+def strip_comments(text: str) -> str:
     """Return Python without comments and empty lines, and with empty docstrings.
 
     By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
 
-    >>> code_of("mark = '#'  # of a comment")
+    >>> strip_comments("mark = '#'  # of a comment")
     "mark = '#'"
     """
     code = REMARK.sub(lambda one: one[1] or "", text)
@@ -206,10 +206,10 @@ def code_of(text: str) -> str:
 
 def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
     """The root of the working tree that a package is tracked in, and its program's files; None: in none."""
-    root = git(folder, "rev-parse", "--show-toplevel")
-    if not root or not git(folder, "ls-files"):
+    root = run_git(folder, "rev-parse", "--show-toplevel")
+    if not root or not run_git(folder, "ls-files"):
         return None
-    files = git(Path(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard") or ""
+    files = run_git(Path(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard") or ""
     texts = [one for one in files.split("\0") if one.endswith(PROGRAM)]
     own = str(folder.relative_to(root))  # of a plugin among the examples, too
     return Path(root), [one for one in texts if not one.startswith(NO_PROGRAM) or one.startswith(own)]
@@ -226,7 +226,9 @@ def _of_files(root: Path, files: Iterable[str]) -> str:
 def _content_of(file: str | Path) -> str:
     """The hash of a file, of Python of what it does."""
     if Path(file).suffix == ".py":
-        return sha256(code_of(Path(file).read_text(encoding="utf-8", errors="replace")).encode()).hexdigest()
+        return sha256(
+            strip_comments(Path(file).read_text(encoding="utf-8", errors="replace")).encode()
+        ).hexdigest()
     with open(file, "rb") as stream:
         return file_digest(stream, "sha256").hexdigest()
 

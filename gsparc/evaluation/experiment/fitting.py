@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 
 from gsparc.data.executor import run_each
 from gsparc.data.files import is_out_of_space
-from gsparc.evaluation.console import one_line
+from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
-from gsparc.evaluation.experiment.done import State, finished, once
+from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
-from gsparc.evaluation.results import rows_of, score_db
+from gsparc.evaluation.results import result_rows, score_db
 from gsparc.models.checkpoint import MODEL
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Filled:
     @property
     def row(self) -> dict[str, Any]:
         """Return the row of the table of results."""
-        return rows_of(self.facts)[0]
+        return result_rows(self.facts)[0]
 
     @property
     def checkpoint(self) -> Path:
@@ -83,7 +83,7 @@ class Prepared:
 
     def result(self) -> Filled | None:
         """Return the result, if it is done."""
-        facts = finished(self.folder, self.state, self.reuse)
+        facts = read_finished(self.folder, self.state, self.reuse)
         return None if facts is None else self.filled(facts)
 
     def filled(self, facts: dict[str, Any]) -> Filled:
@@ -110,12 +110,12 @@ Run = Callable[[Prepared, str | None], object]
 def _tried(run: Run, one: Prepared) -> Filled | str:
     """The cell, or why it cannot be filled; one failing cell does not stop the table."""
     try:
-        return one.filled(once(one.folder, one.state, partial(run, one), reuse=one.reuse))
+        return one.filled(run_once(one.folder, one.state, partial(run, one), reuse=one.reuse))
     except Exception as error:  # any error of a plugin
         if is_out_of_space(error):  # the others would be trained in vain
             raise
         unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
-        return one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
+        return error_in_one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
 
 
 def fill_all(

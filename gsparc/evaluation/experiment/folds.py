@@ -18,8 +18,8 @@ from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import plain
-from gsparc.evaluation.intervals import pooled
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.intervals import pool_figures
+from gsparc.evaluation.scores import score_methods
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import for_stations
@@ -88,7 +88,7 @@ class Outcome:
 
     def scored_on(self, data: Measurements, split: Split) -> Outcome:
         """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
-        return replace(self, figures=pooled(score(self.methods, data, split), data, split))
+        return replace(self, figures=pool_figures(score_methods(self.methods, data, split), data, split))
 
 
 def in_folders(whole: FitContext, split: Split) -> list[FitContext]:

@@ -15,11 +15,11 @@ from gsparc.models.method import Method
 from gsparc.prediction.timing import (
     COPY,
     ClockSettings,
-    cycling,
-    interleaved,
-    percentiles,
-    queries,
+    cycle_queries,
+    draw_queries,
+    median_and_p95,
     reference_copy,
+    time_interleaved,
 )
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Latency:
     rounds: int
 
 
-def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
+def time_queries(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     """One row per method, from the first of its checkpoints."""
     data, split = problem.data, problem.folds
     methods: dict[str, Method] = {}
@@ -56,14 +56,14 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
         if one.cell.method not in methods:
             # The first of a method's cells stands for all of its budgets and seeds.
             methods[one.cell.method] = loading.load(one.checkpoint)[0]
-    calls = cycling(methods, queries(data, split.folds[0].test))
+    calls = cycle_queries(methods, draw_queries(data, split.folds[0].test))
     found: dict[str, Latency] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
-        times = interleaved({COPY: reference_copy(), **{name: calls[name] for name in names}}, clock)
+        times = time_interleaved({COPY: reference_copy(), **{name: calls[name] for name in names}}, clock)
         copy = float(np.median(times.pop(COPY)))
         for name, values in times.items():
-            found[name] = Latency(*percentiles(values), float(np.median(values)) / copy, len(values))
+            found[name] = Latency(*median_and_p95(values), float(np.median(values)) / copy, len(values))
 
     # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
     timed(calls, ONCE)
@@ -74,7 +74,7 @@ def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     return {name: found[name] for name in methods}
 
 
-def timed_here(
+def time_by_dataset(
     filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem]
 ) -> dict[str, dict[str, Latency]]:
     """Return latencies by dataset and method, of the first split that is there and keeps its models."""
@@ -85,5 +85,5 @@ def timed_here(
         present = [one for one in here if one.cell.split == split and one.checkpoint.exists()]
         if present:
             log.info("%s: timing single queries of every method in turns", dataset)
-            found[dataset] = latencies(present, problems[dataset, split])
+            found[dataset] = time_queries(present, problems[dataset, split])
     return found

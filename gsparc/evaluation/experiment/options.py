@@ -48,7 +48,7 @@ def command_line_options() -> dict[str, str]:
     return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
 
 
-def noting(config: DictConfig, method: MethodFactory) -> Reads:
+def options_to_note(config: DictConfig, method: MethodFactory) -> Reads:
     """Return what is to be noted of the options of the command line, for what `config.model` describes."""
     options = []
     for path in command_line_options():
@@ -75,7 +75,7 @@ def _holders(path: str, node: DictConfig, method: MethodFactory) -> Iterator[tup
         yield type(getattr(method, owner) if owner else method), attribute
 
 
-def unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
+def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:
     """Name the options without effect, in one warning too; None where there are none.
 
     Args:

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
 
-from gsparc.evaluation.drawing import logarithmic, look, panels, save
-from gsparc.evaluation.experiment.table import SCORE, by_mean_behind
+from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
+from gsparc.evaluation.experiment.table import SCORE, methods_by_mean_behind
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 # Fits that only keep rows take microseconds: decades of a logarithmic axis for them alone.
@@ -44,7 +44,9 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     handles: dict[str, Artist] = {}
     # dict: each method once, though it is in many panels.
     for axis in grid.flat:
-        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+        # The line with its mark: an `errorbar` would be shown with bars that no point has.
+        lines, names = axis.get_legend_handles_labels()
+        handles |= {name: line[0] for name, line in zip(names, lines, strict=True)}
     figure.legend(
         list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
     )
@@ -54,10 +56,10 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
 def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
     for name, own in rows.dropna(subset=horizontal).groupby("method", sort=False):
         own = own.sort_values("budget_s", na_position="first")
-        style = look(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
+        style = style_of(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
         x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
         axis.errorbar(x, own.score_db, spread, label=name, **style)
-    logarithmic(axis, fine=False)
+    set_log_axis(axis, fine=False)
 
 
 LINE = 0.34  # height of a method [inch]
@@ -65,7 +67,7 @@ LINE = 0.34  # height of a method [inch]
 
 def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> None:
     """Save a panel per split: mean and standard error over draws, of rows as of `rows_of` of one dataset."""
-    splits, names = list(rows.split.unique()), list(by_mean_behind(rows))
+    splits, names = list(rows.split.unique()), list(methods_by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
         here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the longest budget
@@ -77,7 +79,7 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
             row = here.loc[name]
-            bar = {"color": look(name).colour, "alpha": 1.0 if name == best else 0.45, "capsize": 2.5}
+            bar = {"color": style_of(name).colour, "alpha": 1.0 if name == best else 0.45, "capsize": 2.5}
             axis.barh(number, row.value, xerr=row.value_error, **bar)
             axis.text(
                 min(row.value + row.value_error + 0.02 * most, 1.02 * most), number,
@@ -131,7 +133,7 @@ def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
             line, *_ = axes.errorbar(factor * own[x], own[y], spread, marker="o", capsize=2, label=variant)
             if len(clean) and what != "none" and y == ACCURACY:
                 axes.axhline(clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1)
-        logarithmic(axes)
+        set_log_axis(axes)
         axes.set(xlabel=label, ylabel=name if y == ACCURACY else TRAINING)
         if y != ACCURACY:
             axes.set_yscale("log")

@@ -19,7 +19,8 @@ from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
-from gsparc.evaluation.experiment.done import content
+from gsparc.evaluation.experiment.done import measurements_hash
+from gsparc.models.powers.together.network import network_of
 from gsparc.models.registry import complete
 from gsparc.simulate.scenes.build import names_scene
 
@@ -64,7 +65,7 @@ class Problem:
         chosen: overrides of train.yaml for dataset and split, but for the draw.
         data: measurements.
         folds: which rows learn and which test.
-        content: hash of the measurements, see `done.content`.
+        content: hash of the measurements, see `done.measurements_hash`.
         draw: number of the split's draw; None where it is not drawn again.
     """
 
@@ -87,12 +88,19 @@ class Problem:
         return self.data.site.stations is not None and self.folds.name != "stations"
 
     @property
+    def network(self) -> bool:
+        """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
+        return (
+            self.kind == "rssi" and self.data.site.stations is not None and network_of(self.data) is not None
+        )
+
+    @property
     def scene(self) -> bool:
         """Whether the measurements name a scene that a ray tracer loads."""
         return names_scene(self.data.provenance)
 
 
-def named(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
+def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
     """Return named settings of conf/compare.yaml, `methods` or `splits`; an empty entry has defaults.
 
     Raises:
@@ -116,7 +124,7 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             # Measurements are read once: splits and draws choose rows of the same arrays.
             if read is None:
                 data = load(plain(config.dataset))
-                read = data, content(data)
+                read = data, measurements_hash(data)
             folds = split_for(plain(config.split), read[0])
             problems.append(Problem(name, split.name, chosen, read[0], folds, read[1], draw))
     return problems
@@ -153,14 +161,14 @@ def _composed(overrides: tuple[str, ...]) -> DictConfig:
     return config
 
 
-def problems_of(settings: Mapping[str, Any]) -> list[Problem]:
+def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     """Every dataset under every split that is meant for it, first draws first: the best-known come first.
 
     Raises:
         ValueError: no dataset has a path, or none of those that have one is wanted.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
-    splits = named("splits", SplitChoice, settings["splits"])
+    splits = read_entries("splits", SplitChoice, settings["splits"])
     problems, absent = list[Problem](), list[str]()
     for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
         paths = [

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,15 +16,21 @@ from gsparc.data.executor import run_each
 from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.done import State, once
+from gsparc.evaluation.experiment.done import State, run_once
 from gsparc.evaluation.experiment.folds import Outcome, fit_folds, in_folders
 from gsparc.evaluation.metric_formats import DECIDING
-from gsparc.evaluation.results import under
+from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import displaced
-from gsparc.prediction.timing import ClockSettings, cycling, interleaved, percentiles, queries
+from gsparc.prediction.timing import (
+    ClockSettings,
+    cycle_queries,
+    draw_queries,
+    median_and_p95,
+    time_interleaved,
+)
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -67,24 +73,24 @@ class Condition:
     def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Return its part of a cell's summary."""
         names = {"figure": facts["figure"], "model": str(self.model(folder))}
-        return {**asdict(self), **names, **under(facts, str(self))}
+        return {**asdict(self), **names, **facts_under(facts, str(self))}
 
     def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Return data and rows of a fold under this condition."""
         if self.what == "keep":
-            return data, thinned(fold, self.amount, seed)
+            return data, thin_fold(fold, self.amount, seed)
         if self.what == "directions":
-            return with_direction_errors(data, self.amount, seed), fold
+            return add_direction_errors(data, self.amount, seed), fold
         if self.what not in ("train", "train_known"):
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
-        moved = with_position_errors(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
+        moved = add_position_errors(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
     def tested_on(self, data: Measurements, split: Split, seed: int) -> Measurements:
         """Return data whose test rows are asked about."""
-        return with_position_errors(
+        return add_position_errors(
             data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed
         )
 
@@ -93,20 +99,6 @@ ROW = (
     "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
     "query_ms", "query_p95_ms",
 )  # fmt: skip
-NAMES = ("variant", "what", "amount", "figure", "value", "spread")
-
-
-def facts_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return figures as `study/<variant>[/<what>/<amount>]/*`: accuracy under its own name, s, ms."""
-    facts: dict[str, Any] = {}
-    for row in rows.to_dict("records"):
-        stem = f"study/{row['variant']}" + (
-            "" if row["what"] == "none" else f"/{row['what']}/{row['amount']:g}"
-        )
-        own = {row["figure"]: row["value"], f"{row['figure']}_spread": row["spread"]}
-        own |= {name: value for name, value in row.items() if name not in NAMES}
-        facts |= {f"{stem}/{name}": value for name, value in own.items() if pd.notna(value)}
-    return facts
 
 
 @dataclass(frozen=True)
@@ -171,7 +163,7 @@ class Study:
         """The facts of a cell, or why the data do not allow it."""
         folder = context.run_dir / cell[0] / str(cell[1])
         try:
-            return once(folder, state, lambda left: self._done(*cell, folder, data, split, context))
+            return run_once(folder, state, lambda left: self._done(*cell, folder, data, split, context))
         # Only what the data do not allow: any other error is a mistake and ends the study.
         except ValueError as refused:
             if REFUSED not in str(refused):
@@ -227,8 +219,8 @@ class Study:
             file: loading.made_again(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
-        times = interleaved(cycling(methods, queries(data, split.folds[0].test)), self.clock)
-        rows[["query_ms", "query_p95_ms"]] = [percentiles(times[file]) for file in rows.model]
+        times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
+        rows[["query_ms", "query_p95_ms"]] = [median_and_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
 
 
@@ -240,67 +232,37 @@ def _value(outcome: Outcome, figure: str) -> float:
 
 
 @dataclass(frozen=True)
-class Effects:
-    """What each effect costs, and what it gains: the data stay as they are."""
-
-    title: ClassVar[str] = "what effects cost and gain"
-
-    def conditions(self) -> list[Condition]:
-        """Return the data as they are."""
-        return [Condition()]
-
-
-@dataclass(frozen=True)
-class Positions:
-    """What errors of positions and of directions of arrival cost.
+class DataChanges:
+    """What a study changes about the data, one thing at a time; nothing: the variants alone are compared.
 
     Attributes:
-        errors_m: standard deviations of each coordinate [m].
+        title: of its table and figure.
+        errors_m: standard deviations of each coordinate of places [m].
         errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
         train_errors: whether training positions are disturbed, too; else those of queries alone.
-    """
-
-    title: ClassVar[str] = "accuracy against errors of positions and directions"
-    errors_m: Sequence[float] = ()
-    errors_deg: Sequence[float] = ()
-    train_errors: bool = True
-
-    def conditions(self) -> list[Condition]:
-        """Return no error, then of a `query`, in training (`train_known`: of known size), of `directions`."""
-        errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
-        return [
-            Condition(),
-            *(
-                Condition(what, error)
-                for what in ("query", *(("train", "train_known") if self.train_errors else ()))
-                for error in errors
-            ),
-            *(Condition("directions", error) for error in degrees),
-        ]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Accuracy against the number of measurements.
-
-    Attributes:
         keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones are
             subsets of larger ones. Validation rows are thinned with them, test rows stay.
     """
 
-    title: ClassVar[str] = "accuracy against the number of measurements"
-    keep: Sequence[float] = (1.0,)
+    title: str
+    errors_m: Sequence[float] = ()
+    errors_deg: Sequence[float] = ()
+    train_errors: bool = True
+    keep: Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        if not self.keep or not all(float(keep) > 0 for keep in self.keep):
+        if not all(float(keep) > 0 for keep in self.keep):
             raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
 
     def conditions(self) -> list[Condition]:
-        """Return a condition per training set, called `keep`."""
-        return [Condition("keep", float(keep)) for keep in self.keep]
+        """Return the data as they are, but where rows are thinned, then every change by every amount."""
+        placed = ("query", *(("train", "train_known") if self.train_errors else ()))
+        amounts = {**dict.fromkeys(placed, self.errors_m), "directions": self.errors_deg, "keep": self.keep}
+        changed = [Condition(what, float(amount)) for what, every in amounts.items() for amount in every]
+        return changed if self.keep else [Condition(), *changed]
 
 
-def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
+def add_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
     """Add errors N(0, error_m^2) per coordinate to the recorded places of `rows`; measured values stay.
 
     Rows of one place, heard by several stations, have one error.
@@ -311,7 +273,7 @@ def with_position_errors(data: Measurements, rows: np.ndarray, error_m: float, s
     return displaced(data, rows, offset[first][place.reshape(-1)])
 
 
-def with_direction_errors(
+def add_direction_errors(
     data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
 ) -> Measurements:
     """Disturb directions of arrival as a receiver measures them; all else stays.
@@ -342,7 +304,7 @@ def with_direction_errors(
     return replace(data, directions=measured)
 
 
-def thinned(fold: Fold, keep: float, seed: int) -> Fold:
+def thin_fold(fold: Fold, keep: float, seed: int) -> Fold:
     """Return a fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
 
     Args:

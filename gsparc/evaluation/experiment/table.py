@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,8 +12,10 @@ import pandas as pd
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
+from gsparc.evaluation.metric_formats import CALIBRATION, form_of, heading_of
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import BUSY, TRAIN_S, markdown_table, shown
+from gsparc.evaluation.summary import BUSY
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 
 SECOND: dict[Scored, str] = {
     "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
@@ -27,7 +28,13 @@ SCORE = {
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, by their columns
     "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
+    "chi2": CALIBRATION,
 }  # fmt: skip
+BESIDE_COLUMNS = (
+    Column("after a constant, dB", ".2f", of="after_constant"),
+    Column("in 90 % interval", ".2f", of="coverage"), Column("outage, Brier score", ".4f", of="outage"),
+    Column(heading_of(CALIBRATION), form_of(CALIBRATION), of="chi2"),
+)  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 PROBLEM = ["dataset", "split"]
@@ -35,13 +42,13 @@ GROUP = [*PROBLEM, "budget_s", "method"]
 CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
-    "behind_error_db", "coverage", "outage", "after_constant", "second", "second_value", "train_s",
+    "behind_error_db", *BESIDE, "second", "second_value", "train_s",
     "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
 ]  # fmt: skip
 
 
-def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
-    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
+def table_of_cells(filled: Sequence[Filled]) -> pd.DataFrame:
+    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
     rows = []
     for one in filled:
         own = one.row
@@ -55,11 +62,11 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
         return pd.DataFrame(columns=CELL)
     # pandas would make 1.0 of 1 where another row has None.
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
-    numbers = ["budget_s", "load", "coverage", "outage", "after_constant", "second_value"]
+    numbers = ["budget_s", "load", *BESIDE, "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def average_cells(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
@@ -75,22 +82,20 @@ def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
         `behind_db`: how much the problem's best has more, mean of the same draws, and its standard error.
         `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
-        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB].
+        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB]; `chi2`: of
+        `reduced_chi_squared`.
         `train_s`, `train_cpu_s`: seconds of training per model, on the clock and of the processor.
         `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same rounds.
         `load`: 1-minute load per core at the end of the training.
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
-    cells = cells_of(filled)
+    cells = table_of_cells(filled)
     if cells.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
     cells["behind_db"] = _behind(cells)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    means = [
-        "score_db", "value", "behind_db", "coverage", "outage", "after_constant", "second_value", "train_s",
-        "train_cpu_s", "load",
-    ]  # fmt: skip
+    means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
     rows[["figure", "second"]] = groups[["figure", "second"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
@@ -130,7 +135,7 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
     return behind
 
 
-def blocks_of(rows: pd.DataFrame) -> list[pd.DataFrame]:
+def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
     """Return a table per dataset, split and budget, best first; methods without a budget stand in each."""
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
@@ -188,58 +193,37 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     return lines
 
 
-def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
-    """All blocks as one page."""
-    return "\n\n".join(_page(block, ours) for block in blocks) + "\n"
-
-
-def _page(block: pd.DataFrame, ours: str) -> str:
-    columns = _columns(block)
-    lines = []
-    for row in block.itertuples():
-        cells = [write(row) for write in columns.values()]
-        lines.append([f"**{cell}**" for cell in cells] if row.method == ours else cells)
-    table = markdown_table(columns, lines, numbers=True)
-    return "\n".join([f"### {title_of(block)}", "", *table, "", *(f"- {r}" for r in remarks(block, ours))])
-
-
-def _columns(block: pd.DataFrame) -> dict[str, Callable[[Any], str]]:
-    """Head of each column, and how a row fills it; columns that no row fills are left out."""
-    figure, draws = block.figure.iloc[0], block.draws.any()
-
-    def column(name: str, form: str, error: str | None = None) -> Callable[[Any], str]:
-        def write(row: Any) -> str:
-            near = np.nan if error is None else getattr(row, error)
-            return shown(getattr(row, name), form) + ("" if np.isnan(near) else f" ± {near:{form}}")
-
-        return write
-
-    columns: dict[str, Callable[[Any], str]] = {
-        "method": lambda row: row.method + row.label,
-        SCORE[figure]: column("score_db", ".2f", "spread_db"),
-    }
-    if draws:
-        columns["behind the best, dB"] = column("behind_db", ".2f", "behind_error_db")
+def table_of(block: pd.DataFrame, ours: str) -> Table:
+    """Return a block as a table, the row of `ours` bold, without columns that no row fills."""
+    figure, draws, score = block.figure.iloc[0], block.draws.any(), value_with_error("score_db", "spread_db")
     # Of the others it is the score but for its sign.
-    if figure.startswith("nmse") or (figure == "rmse_db" and not draws):
-        columns[figure] = column("value", ".3g" if draws else ".4g", "value_error")
-    columns[block.second.iloc[0]] = column("second_value", ".4g")
-    for name, head, form in (
-        ("after_constant", "after a constant, dB", ".2f"), ("coverage", "in 90 % interval", ".2f"),
-        ("outage", "outage, Brier score", ".4f"),
-    ):  # fmt: skip
-        if block[name].notna().any():
-            columns[head] = column(name, form)
-    if not draws:
-        columns["seeds"] = column("seeds", "d")
-    costs = (
-        ("train_s", TRAIN_S, ".3g"), ("train_cpu_s", "cpu s/fold", ".3g"),
-        ("query_ms", "query ms p50", ".3g"), ("query_p95_ms", "p95", ".3g"), ("to_copy", "x copy", ".2g"),
-    )  # fmt: skip
-    return columns | {head: column(name, form) for name, head, form in costs}
+    valued = figure.startswith("nmse") or (figure == "rmse_db" and not draws)
+    value = value_with_error("value", "value_error")
+    columns = [
+        (True, Column("method", "", of=lambda row: row["method"] + row["label"])),
+        (True, Column(SCORE[figure], ".2f", of=score)),
+        (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
+        (valued, Column(figure, ".3g" if draws else ".4g", of=value)),
+        (True, Column(block.second.iloc[0], of="second_value")),
+        *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
+        (not draws, Column("seeds", "d", of="seeds")),
+        *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
+    ]
+    own = block[block.method == ours]
+    bold = {"bold": str((own.method + own.label).iloc[0])} if len(own) else {}
+    shown = [column for there, column in columns if there]
+    return Table.of(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
 
 
-def by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
+def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
+    """All blocks as one page, each with what it shows."""
+    return "\n".join(
+        "\n".join([table_of(block, ours).markdown(), *(f"- {r}" for r in remarks(block, ours)), ""])
+        for block in blocks
+    )
+
+
+def methods_by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
     """Methods, the least behind first: mean over the splits that each is possible on."""
     behind = rows.assign(behind_db=rows.behind_db.fillna(0.0)).groupby("method", sort=False).behind_db.mean()
     return list(behind.sort_values(kind="stable").index)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,24 +16,29 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baselines import baseline
-from gsparc.evaluation.drawing import logarithmic, look, panels
+from gsparc.evaluation.baselines import FittedBaseline, fit_baseline
+from gsparc.evaluation.drawing import panels, set_log_axis, style_of
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened
-from gsparc.evaluation.scores import rows_of, score
+from gsparc.evaluation.scores import rows_to_score, score_methods
+from gsparc.evaluation.table import Column
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Point, Settings, worded
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import Call, ClockSettings, interleaved
+from gsparc.prediction.timing import Call, ClockSettings, time_interleaved
 
 log = logging.getLogger(__name__)
 
+POINT = (  # columns of the table of points
+    Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
+    Column("ms p95", ".3g", of="render_ms_p95"),
+)  # fmt: skip
 CLOSEST_DB = 100.0  # the precision of float32
 
 
-def sweep(
+def measure_candidates(
     candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], data: Measurements, fold: Fold, *,
     eval_on: str, clock: ClockSettings, others: Mapping[str, Call],
 ) -> tuple[list[Point], dict[str, np.ndarray]]:  # fmt: skip
@@ -54,13 +58,13 @@ def sweep(
     split = Split("tradeoff", (fold,), "")
     scored: list[tuple[dict[str, float | None], float]] = []
     whole = None
-    places = data.moving[rows_of(fold, eval_on)]
+    places = data.moving[rows_to_score(fold, eval_on)]
     for number, (_, method) in enumerate(candidates):
-        recorded = Recorded(method)
-        there = score([recorded], data, split, eval_on)
+        recorded = RecordingView(method)
+        there = score_methods([recorded], data, split, eval_on)
         answers = torch.cat(recorded.means)
         whole = answers if whole is None else whole
-        scored.append((there.figures(), closeness(answers, whole)))
+        scored.append((there.figures(), closeness_db(answers, whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
@@ -68,7 +72,7 @@ def sweep(
         ask = Predictor(method, data.site).cycling(places)
         calls |= {(index, count): ask for count in threads}
     # A copy of memory, the unit of the others' times, is made by one thread.
-    times = interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
+    times = time_interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
     points = []
     for key, ms in times.items():
         if isinstance(key, str):
@@ -80,7 +84,7 @@ def sweep(
     return points, {name: times[name] for name in others}
 
 
-class Recorded(View):
+class RecordingView(View):
     """A method whose answers are kept while it is scored.
 
     Attributes:
@@ -98,26 +102,17 @@ class Recorded(View):
         return prediction
 
 
-def closeness(answers: Tensor, whole: Tensor) -> float:
+def closeness_db(answers: Tensor, whole: Tensor) -> float:
     """Return how near answers (n, ...) are to the full model's [dB], which takes no measurement."""
     # 1e-30: two equal answers, or two of nothing, have no ratio.
     apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
 
-@dataclass(frozen=True)
-class Other:
-    """Another method on the same axes: its accuracy and median latency [ms]."""
-
-    value: float
-    p50: float
-    p95: float
-
-
-def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> str | None:
+def beaten_by(point: Point, others: Mapping[str, Point], figure_name: str) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     own = score_of(figure_name, point.value(figure_name))
-    better = {n: score_of(figure_name, r.value) for n, r in others.items() if r.p50 <= point.p50}
+    better = {n: score_of(figure_name, r.value(figure_name)) for n, r in others.items() if r.p50 <= point.p50}
     best = max(better, key=lambda name: better[name], default=None)
     return best if best is not None and better[best] >= own else None
 
@@ -125,7 +120,7 @@ def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> st
 def draw_front(
     points: Sequence[Point],
     on_front: Sequence[int],
-    others: Mapping[str, Other],
+    others: Mapping[str, Point],
     figure_name: str,
     method: str,
     title: str,
@@ -139,23 +134,23 @@ def draw_front(
 
     x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
     reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
-    own, label = look(method).colour, "not beaten (to 95th percentile)"
+    own, label = style_of(method).colour, "not beaten (to 95th percentile)"
     axes.errorbar(x, y, xerr=reach, fmt="o-", color=own, capsize=2, lw=1, ms=4, label=label)
     for number, place in enumerate(zip(x, y, strict=True), 1):
         above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
         axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
     for name, other in others.items():
-        axes.plot([other.p50], [other.value], ms=6, **look(name).marked)
-        place = other.p50, other.value
-        axes.annotate(name, place, (6, -4), textcoords="offset points", color=look(name).colour)
-    logarithmic(axes)
+        axes.plot([other.p50], [other.value(figure_name)], ms=6, **style_of(name).marked)
+        place = other.p50, other.value(figure_name)
+        axes.annotate(name, place, (6, -4), textcoords="offset points", color=style_of(name).colour)
+    set_log_axis(axes)
     worst, best = min(y), max(y)  # far-off others would flatten the front
     if lower_is_better(figure_name):
         axes.set_yscale("log")
         axes.invert_yaxis()
     else:
         axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
-        below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
+        below = [name for name, other in others.items() if other.value(figure_name) < axes.get_ylim()[0]]
         if below:
             axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
     axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
@@ -174,14 +169,16 @@ def draw_front(
     return figure
 
 
-def others_of(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, tuple[Method, float | None]]:
-    """Baselines with the deciding figure of each."""
-    fitted = {name: baseline(name, run.data, run.split, eval_on) for name in baselines}
+def fit_others(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, FittedBaseline]:
+    """Baselines whose deciding figure is defined, fitted."""
+    fitted = {name: fit_baseline(name, run.data, run.split, eval_on) for name in baselines}
     figure = DECIDING[run.data.site.scored]
-    return {name: (one.methods[0], one.scores.figures()[figure]) for name, one in fitted.items()}
+    return {name: one for name, one in fitted.items() if one.scores.figures()[figure] is not None}
 
 
-def table_of(points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float) -> pd.DataFrame:
+def table_of_points(
+    points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float
+) -> pd.DataFrame:
     """Return a row a point, those of `tradeoff.csv`: the fastest first."""
     rows = [
         {
@@ -201,7 +198,7 @@ def _cell(value: Any) -> Any:
 
 
 def facts_of(
-    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Point], copy_ms: float
 ) -> dict[str, Any]:
     """`tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
@@ -216,17 +213,14 @@ def facts_of(
         f"test/{figure}": full.value(figure),
     }
     for name, other in others.items():
-        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
+        facts |= {
+            f"baseline/{name}/{figure}": other.value(figure),
+            f"baseline/{name}/render_ms_p50": other.p50,
+        }
     return facts
 
 
-def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
-    """Heads and rows of the table of points."""
-    rows = [[p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}"] for p in best]
-    return ["point", "ms p50", "ms p95", figure], rows
-
-
-def irreducible(method: Method) -> list[str]:
+def why_irreducible(method: Method) -> list[str]:
     """Return a sentence where there is nothing to weigh against time."""
     if method.knobs():
         return []

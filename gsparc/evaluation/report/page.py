@@ -17,10 +17,10 @@ from PIL import Image
 
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
-from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
-from gsparc.evaluation.report.table import Table
+from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
+from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
 PICTURE_PX = 1000  # width at which pictures are kept
@@ -28,7 +28,7 @@ MOST_PICTURES = 6
 
 
 @dataclass
-class Study:
+class Section:
     """Runs whose figures can be compared: one dataset, one kind of split.
 
     Attributes:
@@ -48,27 +48,31 @@ class Study:
     pictures: list[tuple[str, str]] = field(default_factory=list)
 
 
-def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()) -> list[Study]:
+def make_sections(
+    runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()
+) -> list[Section]:
     """Everything there is to show, study by study; `fronts`: names of datasets, `tradeoff.csv` by column."""
     return [
         _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
-        for (dataset, split), group in by_study(runs).items()
+        for (dataset, split), group in group_by_study(runs).items()
     ]
 
 
-def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
-    runs = distinct_overrides(group)
-    study = Study(title, warnings(runs))
+def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Section:
+    runs = drop_shared_overrides(group)
+    study = Section(title, warnings(runs))
     # With one run a setting, spreads over seeds would be empty brackets.
-    if len(tables.grouped(runs)) < len(runs):
-        study.tables.append(tables.seeds(runs))
-    study.tables += [table for table in (tables.results(runs), tables.worst(runs)) if table.rows]
-    study.figures = [plots.pareto(runs, fronts), plots.accuracy_cdf(runs)]
+    if len(tables.group_by_setting(runs)) < len(runs):
+        study.tables.append(tables.table_of_seeds(runs))
+    study.tables += [
+        table for table in (tables.table_of_results(runs), tables.table_of_worst(runs)) if table.rows
+    ]
+    study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
     study.plots = [
-        (str(figure.get_label()), _unique_ids(plots.svg(figure), number))
+        (str(figure.get_label()), _unique_ids(plots.to_svg(figure), number))
         for number, figure in enumerate(study.figures)
     ]
-    firsts = [group[0] for group in tables.grouped(runs).values()]
+    firsts = [group[0] for group in tables.group_by_setting(runs).values()]
     study.pictures = [
         (f"{run.setting}{what}", _png(run.folder / name))
         for run in firsts[:MOST_PICTURES]
@@ -106,18 +110,18 @@ def _png(path: Path) -> str:
     return base64.b64encode(out.getvalue()).decode()
 
 
-def html(title: str, note: str, sections: Sequence[Study]) -> str:
+def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
     """Return the page; `note` says where it comes from."""
     text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
 
 
-def write(
-    folder: Path, title: str, note: str, sections: Sequence[Study], figures: Sequence[str] = ()
+def write_report(
+    folder: Path, title: str, note: str, sections: Sequence[Section], figures: Sequence[str] = ()
 ) -> None:
     """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(html(title, note, sections), encoding="utf-8")
+    (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:
         parts.append(f"## {study.title}\n")

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
+from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis, style_of
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
-from gsparc.evaluation.report.runs import Run, sizes
-from gsparc.evaluation.report.table import interval
-from gsparc.evaluation.report.tables import grouped
+from gsparc.evaluation.report.runs import Run, error_sizes
+from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
 from gsparc.models.pareto import front
 
 WIDE, TALL = 7.0, 3.8
@@ -31,7 +30,7 @@ CDFS: dict[Scored, tuple[str, ...]] = {
 }  # fmt: skip
 
 
-def svg(figure: Figure) -> str:
+def to_svg(figure: Figure) -> str:
     """Return the figure as an SVG element, without the XML head; text stays text."""
     out = io.StringIO()
     # Text as text is searched and scaled; a fixed salt and no date give equal files for equal runs.
@@ -42,14 +41,14 @@ def svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
+def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
     name, axes = runs[0].row["figure"], _axes()
     points: list[tuple[float, float]] = []
     for (setting, group), style in _styled(runs):
         for run in group:
             p50, p95 = run.row["query_ms"], run.row["query_p95_ms"]
-            estimate = interval(run.row, name)
+            estimate = interval_of_figure(run.row, name)
             if p50 is None or estimate is None:
                 continue
             axes.errorbar(
@@ -58,7 +57,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             )  # fmt: skip
             points.append((p50, estimate.value))
     for base in _rivals(runs):
-        value, ms, look_of = base["value"], base["query_ms"], look(base["method"])
+        value, ms, look_of = base["value"], base["query_ms"], style_of(base["method"])
         if ms is not None:
             axes.plot([ms], [value], **look_of.marked, ms=4)
             how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
@@ -71,7 +70,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     best = front([x for x, _ in points], [score_of(name, y) for _, y in points])
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
-    logarithmic(axes)
+    set_log_axis(axes)
     _accuracy_axis(axes, name)
     if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
         values = [value for _, value in points]
@@ -81,20 +80,20 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     return _finished(axes, "Accuracy against latency (95 % intervals)", what)
 
 
-def accuracy_cdf(runs: Sequence[Run]) -> Figure:
+def draw_accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].row["kind"]], _axes()
     _cdfs(axes, runs, name)
     rival = runs[0].samples.get(f"baseline/gp/{name}")
     if rival is not None and any(base["method"] == "gp" for base in _rivals(runs)):
         share = np.arange(1, len(rival) + 1) / len(rival)
-        axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
+        axes.step(np.sort(rival), share, lw=0.8, label="gp", **style_of("gp").line)
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
 
 
-def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
+def draw_distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
@@ -104,16 +103,16 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, group in grouped(runs).items():
+    for setting, group in group_by_setting(runs).items():
         seconds = np.mean([run.row["train_s"] for run in group])
         ms = np.mean([run.row["query_ms"] for run in group if run.row["query_ms"] is not None])
-        labels[setting] = f"{short(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
+        labels[setting] = f"{shorten_setting(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
     figure, ((*line,),) = panels(4.2 * len(names), 3.9, 1, len(names))
     for axes, name in zip(line, names, strict=True):
         _cdfs(axes, runs, name, labels)
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
         if name == TIMES:
-            logarithmic(axes, fine=True)
+            set_log_axis(axes, fine=True)
         if name in ("mse", "error_power") and np.isfinite(axes.dataLim.minposx):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
@@ -131,7 +130,7 @@ def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] 
     share their test samples, whose number counts once.
     """
     for (setting, group), style in _styled(runs):
-        every = [run.render_ms if name == TIMES else sizes(run, name) for run in group]
+        every = [run.render_ms if name == TIMES else error_sizes(run, name) for run in group]
         every = [values[np.isfinite(values)] for values in every]
         values = np.sort(np.concatenate(every))
         if not len(values):
@@ -153,10 +152,10 @@ def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:
     """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
-    groups = grouped(runs)
+    groups = group_by_setting(runs)
     names = [str(group[0].row["method"]) for group in groups.values()]
     unique = len(set(names)) == len(names)
-    styles = [look(name).line if unique else numbered(i) for i, name in enumerate(names)]
+    styles = [style_of(name).line if unique else numbered_style(i) for i, name in enumerate(names)]
     return list(zip(groups.items(), styles, strict=True))
 
 
@@ -181,10 +180,10 @@ def _accuracy_axis(axes: Axes, name: str) -> None:
 def _legend(axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        axes.legend(handles, [short(label, 44) for label in labels], fontsize=6.5)
+        axes.legend(handles, [shorten_setting(label, 44) for label in labels], fontsize=6.5)
 
 
-def short(text: str, most: int = 32) -> str:
+def shorten_setting(text: str, most: int = 32) -> str:
     """Overrides by the last part of their names, then cut to `most` characters."""
     words = [word.partition("=") for word in text.split()]
     text = " ".join(

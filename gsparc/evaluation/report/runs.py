@@ -16,10 +16,10 @@ import torch
 from gsparc.data.files import SUMMARY, load_yaml
 from gsparc.evaluation.baselines import BASELINES
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.results import rows_of
+from gsparc.evaluation.results import result_rows
 from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.fitting import leaves
-from gsparc.prediction.timing import BLOCKS, Call, interleaved, percentiles
+from gsparc.prediction.timing import BLOCKS, Call, median_and_p95, time_interleaved
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
@@ -51,7 +51,7 @@ class Run:
         """Its own row of the results, with `setting`, and times measured alone, where they were."""
         own = {**self.rows[0], "setting": self.setting, "run": self}
         if len(self.render_ms):
-            own["query_ms"], own["query_p95_ms"] = percentiles(self.render_ms)
+            own["query_ms"], own["query_p95_ms"] = median_and_p95(self.render_ms)
         return own
 
     @property
@@ -63,8 +63,8 @@ class Run:
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """See `rows_of`; of unknown data those of spectra."""
-        return rows_of(self.facts)
+        """See `result_rows`; of unknown data those of spectra."""
+        return result_rows(self.facts)
 
     @cached_property
     def setting(self) -> str:
@@ -122,7 +122,7 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     return list(runs.values())
 
 
-def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
+def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     """Runs whose figures can be compared, by dataset and split, in order of appearance."""
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
@@ -130,7 +130,7 @@ def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     return groups
 
 
-def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
+def drop_shared_overrides(runs: Sequence[Run]) -> list[Run]:
     """Return the runs with only those overrides in which they differ, so that names are short."""
     if len(runs) < 2:
         return list(runs)
@@ -190,7 +190,7 @@ def _written(path: Path) -> Any:
     return (load_yaml(path.read_text(encoding="utf-8"), path) if path.is_file() else None) or ()
 
 
-def sizes(run: Run, name: str) -> np.ndarray:
+def error_sizes(run: Run, name: str) -> np.ndarray:
     """Return a per-sample figure (n,) of a run, empty where it has none; an error by its size."""
     values = run.samples.get(name, np.zeros(0))
     return np.abs(values) if name == "error_db" else values
@@ -199,7 +199,7 @@ def sizes(run: Run, name: str) -> np.ndarray:
 log = logging.getLogger(__name__)
 
 
-def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
+def time_again(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
     """Return the runs with the times of single queries, each also written to its `render_ms.csv`.
 
     A sweep runs jobs at the same time, which disturbs their times; call this after it.
@@ -225,7 +225,7 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }
-    times = interleaved(calls, replace(BLOCKS, rounds=rounds, budget_s=budget_s), threads)
+    times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, budget_s=budget_s), threads)
     for number, ms in times.items():
         write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
     return [replace(run, render_ms=times[i]) if i in times else run for i, run in enumerate(runs)]

@@ -12,10 +12,9 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.markdown import Markdown
 
 from gsparc.evaluation import summary
-from gsparc.evaluation.console import one_line, open_console
+from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.done import FAILURE
 
 log = logging.getLogger(__name__)
@@ -40,7 +39,7 @@ class SweepReport(Callback):
         if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
             return
         error = job_return._return_value
-        message = one_line(error) if isinstance(error, BaseException) else str(error)
+        message = error_in_one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
         # The mark that `on_multirun_end` counts failures by: other processes' jobs are seen as files alone.
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
@@ -57,7 +56,7 @@ class SweepReport(Callback):
         failed = sorted(folder.rglob(FAILURE))
         console = open_console()
         if any(path.parent != folder for path in folder.rglob("summary.json")):
-            report(folder, str(config.get("title") or folder.name), console, self)
+            report_sweep(folder, str(config.get("title") or folder.name), console, self)
         if failed:
             names = ", ".join(path.parent.name for path in failed)
             console.print(f"error: {len(failed)} jobs failed: {names}", style="red", markup=False)
@@ -65,29 +64,27 @@ class SweepReport(Callback):
             sys.exit(1)
 
 
-def report(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
+def report_sweep(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
-    from gsparc.evaluation.report.page import studies, write
-    from gsparc.evaluation.report.runs import by_study, distinct_overrides, find_runs, retime
-    from gsparc.evaluation.report.tables import seeds
+    from gsparc.evaluation.report.page import make_sections, write_report
+    from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
+    from gsparc.evaluation.report.tables import table_of_seeds
 
     runs = find_runs([folder])
     if settings.retime:
-        runs = retime(runs, rounds=settings.rounds, budget_s=settings.budget_s)
+        runs = time_again(runs, rounds=settings.rounds, budget_s=settings.budget_s)
     origin = summary.provenance()
-    write(folder, title, f"{len(runs)} runs; made by {summary.program_version(origin)}", studies(runs))
-    facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
-    for number, (study, together) in enumerate(by_study(runs).items()):
-        group = distinct_overrides(together)
+    write_report(
+        folder, title, f"{len(runs)} runs; made by {summary.program_version(origin)}", make_sections(runs)
+    )
+    for number, (study, together) in enumerate(group_by_study(runs).items()):
+        group = drop_shared_overrides(together)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
-        table = seeds(group)
+        table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
-        plots.distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
-        console.print(Markdown(table.without(*WIDE).markdown()))
-        for row in table.rows:
-            for column, value in zip(table.columns[1:], row[1:], strict=True):
-                facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)
-    summary.write_summary(folder / "summary.json", facts)
+        plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
+        console.print(table.without(*WIDE))
+    summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
     console.print(f"written to {folder}", highlight=False)

@@ -1,32 +1,78 @@
-"""Tables of runs; no accuracy without its time."""
+"""Tables of runs, figures with their uncertainty; no accuracy without its time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import PER_SAMPLE, TABLES, form_of, heading_of
+from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, form_of, heading_of
 from gsparc.evaluation.report.runs import Run
-from gsparc.evaluation.report.table import Column, Table, interval, over_seeds
-from gsparc.evaluation.summary import TRAIN_S
+from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
+# Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
+DRAWS = 1000
+LEVEL = 0.95
 WORST = 3
-SETTING = Column("method and setting", of="setting")
+SETTING = Column("method and setting", "", of="setting")
 SEED = Column("seed", "d", of="seed")
-TRAIN = Column(TRAIN_S, ".3g", of="train_s")
-P50 = Column("query ms p50", ".3g", of="query_ms")
-P95 = Column("p95", ".3g", of="query_p95_ms")
 SIZE = Column("Gaussians", "d", of="gaussians")
 
 
-def accuracy(figure: str, note: str = "") -> Column:
+def bootstrap_interval(
+    values: np.ndarray, weights: np.ndarray | None = None, seed: int = 0
+) -> tuple[float, float]:
+    """Ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights), resampling samples.
+
+    Samples are taken as independent; neighbours under `split=grouped` are not, so it is a lower bound.
+    """
+    # A fixed seed: the same run has the same interval in every report.
+    draw = np.random.default_rng(seed).integers(0, len(values), (DRAWS, len(values)))
+    below = np.ones_like(values) if weights is None else weights
+    # 1e-300: a draw of silent rows alone has no power to divide by.
+    means = values[draw].sum(1) / np.maximum(below[draw].sum(1), 1e-300)
+    tail = (1 - LEVEL) / 2
+    return float(np.quantile(means, tail)), float(np.quantile(means, 1 - tail))
+
+
+def interval_of_figure(row: Row, figure: str) -> Interval | None:
+    """Return a test figure of a row with its bootstrap interval over test samples, or None."""
+    # Baselines have no samples of their own here, only figures.
+    value, parts = row.get(figure), None if row["baseline"] else _parts(row["run"].samples, figure)
+    if value is None:
+        return None
+    return Interval(value) if parts is None else Interval(value, *bootstrap_interval(*parts))
+
+
+def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """Per-sample numbers whose (weighted) mean is the figure."""
+    # The ratio of sums, not a mean of ratios, which one silent row would decide.
+    if figure == "nmse" and "error_power" in own and "target_power" in own:
+        known = np.isfinite(own["error_power"])
+        return own["error_power"][known], own["target_power"][known]
+    values = own.get(figure)
+    if values is None or values.dtype.kind != "f":
+        return None
+    values = values[np.isfinite(values)]
+    return (values, None) if len(values) > 1 else None
+
+
+def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
+    """Mean, least and largest over those seeds that have a value; None where none has."""
+    known = [value for value in values if value is not None]
+    # A single seed has no spread: no brackets.
+    if len(known) < 2:
+        return Interval(known[0]) if known else None
+    return Interval(float(np.mean(known)), min(known), max(known))
+
+
+def accuracy_column(figure: str, note: str = "") -> Column:
     """Return a test figure, with its interval."""
-    return Column(heading_of(figure), form_of(figure), note, partial(interval, figure=figure))
+    return Column(heading_of(figure), form_of(figure), note, partial(interval_of_figure, figure=figure))
 
 
-def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs that differ by their seed only, by setting, in order of appearance."""
     groups: dict[str, list[Run]] = {}
     for run in runs:
@@ -34,37 +80,38 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return groups
 
 
-def results(runs: Sequence[Run]) -> Table:
+def table_of_results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
+    note = "95 % interval: bootstrap over test samples"
     columns = [
-        SETTING, SEED,
-        *(accuracy(f, "95 % interval: bootstrap over test samples") for f in TABLES[runs[0].row["kind"]]),
+        SETTING, SEED, *(accuracy_column(f, note) for f in TABLES[runs[0].row["kind"]]),
+        Column(heading_of(CALIBRATION), form_of(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
-        Column("memory MB", ".0f", of="memory_mb"), SIZE, Column("effects", of="effects"),
+        Column("memory MB", ".0f", of="memory_mb"), SIZE, Column("effects", "", of="effects"),
         Column("load", ".2f", "1-minute load per core while measured", "load"),
-        Column("data", of=lambda row: str(row["data"])[:8]),
-        Column("commit", of=lambda row: str(row["git"])[:8]),
+        Column("data", "", of=lambda row: str(row["data"])[:8]),
+        Column("commit", "", of=lambda row: str(row["git"])[:8]),
     ]  # fmt: skip
     note = (
         "Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
         "in turns within a run, the models of a sweep alone after it."
     )
-    return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note)
+    return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
 
 
-def seeds(runs: Sequence[Run]) -> Table:
+def table_of_seeds(runs: Sequence[Run]) -> Table:
     """Settings side by side, their spread over seeds, and what they cost."""
-    differs = differing(runs)
-    also = [Column("differs, too")] if any(differs.values()) else []
+    differs = differing_settings(runs)
+    also = [Column("differs, too", "")] if any(differs.values()) else []
     spread = _spread_columns(runs)
     rows = [
         [
             setting, *([differs[setting]] if also else []), len(group),
-            *(over_seeds([column.value(run.row) for run in group]) for column in spread),
+            *(interval_over_seeds([column.value(run.row) for run in group]) for column in spread),
         ]
-        for setting, group in grouped(runs).items()
+        for setting, group in group_by_setting(runs).items()
     ]  # fmt: skip
     columns = [SETTING, *also, Column("seeds", "d"), *spread]
     return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
@@ -78,9 +125,9 @@ def _spread_columns(runs: Sequence[Run]) -> list[Column]:
     return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 
-def differing(runs: Sequence[Run]) -> dict[str, str]:
+def differing_settings(runs: Sequence[Run]) -> dict[str, str]:
     """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
-    groups = grouped(runs)
+    groups = group_by_setting(runs)
     every = {setting: group[0].resolved for setting, group in groups.items()}
     # Names of all runs: a setting may be in one alone.
     names = dict.fromkeys(name for one in every.values() for name in one)
@@ -94,11 +141,11 @@ def differing(runs: Sequence[Run]) -> dict[str, str]:
     }
 
 
-def worst(runs: Sequence[Run]) -> Table:
+def table_of_worst(runs: Sequence[Run]) -> Table:
     """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
     numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]
-    columns = [SETTING, SEED, Column("sample"), Column("where [m]"), *numbers]
+    columns = [SETTING, SEED, Column("sample", ""), Column("where [m]", ""), *numbers]
     rows = []
     for run in runs:
         own = run.samples

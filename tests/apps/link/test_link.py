@@ -21,7 +21,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
-from gsparc.prediction.channels import centred, interpolated, resource_grid
+from gsparc.prediction.channels import centred_grid, interpolate_tones, resource_grid
 from gsparc.prediction.risk import binomial_interval
 from gsparc.training.context import FitContext
 
@@ -61,16 +61,16 @@ def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
         turns = np.outer(delays, frequency - 2.4e9)
         return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[None, None]
 
-    wanted = centred(float(tones.mean()), 30e3, 240)
-    miss = interpolated(response(tones), tones, wanted) - response(wanted)
+    wanted = centred_grid(float(tones.mean()), 30e3, 240)
+    miss = interpolate_tones(response(tones), tones, wanted) - response(wanted)
     assert miss.abs().square().mean() < 1e-3 * response(wanted).abs().square().mean()
     with pytest.raises(ValueError, match="fewer blocks"):
-        interpolated(response(tones), tones, centred(float(tones.mean()), 30e3, 2400))
+        interpolate_tones(response(tones), tones, centred_grid(float(tones.mean()), 30e3, 2400))
 
 
 def test_one_tone_is_flat() -> None:
     assert torch.equal(
-        interpolated(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
+        interpolate_tones(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
     )
 
 
@@ -140,7 +140,7 @@ def test_export_on_any_grid(trained) -> None:
     predictor = load(file)
     rows = fold().test[:2]
     heard = data.uplink[rows] * data.site.target_scale
-    wanted = centred(float(data.site.subcarriers_hz.mean()), 30e3, 48)
+    wanted = centred_grid(float(data.site.subcarriers_hz.mean()), 30e3, 48)
     slot = predictor.csi(uplink=heard, frequency_hz=wanted, symbols=14)
     assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
     tones = predictor.csi(uplink=heard)

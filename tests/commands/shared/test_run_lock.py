@@ -11,14 +11,17 @@ from doors import assert_refused, knock
 from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, hold, locked, release
+from gsparc.commands.shared import run_lock
+from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, RunLock, hold_folder, locked, release_folders
 from gsparc.commands.train import LEFT, train
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import read_run
 from gsparc.models import checkpoint
 
-HOLDS = "import sys, time; from gsparc.commands.shared.run_lock import hold; from pathlib import Path; "
-HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+HOLDS = (
+    "import sys, time; from gsparc.commands.shared.run_lock import hold_folder; from pathlib import Path; "
+)
+HOLDS += "hold_folder(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
 
 
 @pytest.fixture
@@ -50,19 +53,19 @@ def test_training_from_python_took_no_lock(other, tmp_path):
     other.wait()
     with locked(tmp_path), pytest.raises(ValueError, match="another run writes here"), locked(tmp_path):
         pass
-    hold(tmp_path)  # as a command does before it trains
+    hold_folder(tmp_path)  # as a command does before it trains
     with locked(tmp_path):
         pass
-    release()
+    release_folders()
 
 
 def test_a_released_folder_is_free(tmp_path):
-    hold(tmp_path)
-    release()
-    hold(tmp_path)
+    hold_folder(tmp_path)
+    release_folders()
+    hold_folder(tmp_path)
     with pytest.raises(InUse, match=r"another run writes here \(process \d+ on "):
-        hold(tmp_path)
-    release()
+        hold_folder(tmp_path)
+    release_folders()
 
 
 @pytest.mark.parametrize("words", [
@@ -92,8 +95,8 @@ def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwa
     assert not (folder / ".hydra").exists()
     if taken == HOLDER:
         (folder / taken).rmdir()
-        hold(folder)  # the lock was not left behind
-        release()
+        hold_folder(folder)  # the lock was not left behind
+        release_folders()
 
 
 def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_path, monkeypatch):
@@ -132,6 +135,18 @@ def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path)
     assert not (tmp_path / "summary.json").exists() and (tmp_path / "summary.json.earlier").exists()
 
 
+@pytest.mark.parametrize(("goes_on", "kept"), [(None, False), ("run", True)])
+def test_a_new_run_went_on_in_the_log_of_the_one_before(goes_on, kept, tmp_path, monkeypatch):
+    (tmp_path / "train.log").write_text("of the first run")
+    monkeypatch.setattr(run_lock, "_folder", lambda config, key: tmp_path)
+    config = OmegaConf.create({"ckpt_path": goes_on, "hydra": {"output_subdir": ".hydra"}})
+    try:
+        RunLock().on_run_start(config)
+    finally:
+        release_folders()
+    assert (tmp_path / "train.log").exists() == kept
+
+
 def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
     for name in LEFT[:3]:
         (tmp_path / name).write_text("{}")
@@ -156,6 +171,6 @@ def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):
     kept = [here / f".c.json.{os.getppid()}.partial", here / ".mine.partial", here / ".d.e.partial"]
     for path in kept:
         path.write_text("half")
-    hold(here)
-    release()
+    hold_folder(here)
+    release_folders()
     assert sorted(here.rglob("*.partial")) == sorted(kept)

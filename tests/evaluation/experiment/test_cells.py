@@ -6,8 +6,8 @@ import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.experiment.cells import Budget, Contender, plan
-from gsparc.evaluation.experiment.problem import SplitChoice, named
+from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells
+from gsparc.evaluation.experiment.problem import SplitChoice, read_entries
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -19,12 +19,12 @@ BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
 
 
 def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
-    own = {"draw": None, "stations": False, "scene": False}
+    own = {"draw": None, "stations": False, "scene": False, "network": False}
     return SimpleNamespace(dataset=dataset, split=split, kind=kind, **(own | others))
 
 
 def names(*only: str, kind: str = "spectrum") -> list[str]:
-    return [str(cell) for _, cell in plan([problem("rfid", kind=kind)], METHODS, BUDGETS, only)]
+    return [str(cell) for _, cell in plan_cells([problem("rfid", kind=kind)], METHODS, BUDGETS, only)]
 
 
 def test_a_whole_table_comes_before_further_seeds_and_budgets():
@@ -38,7 +38,7 @@ def test_a_whole_table_comes_before_further_seeds_and_budgets():
 def test_every_room_has_its_first_table_before_any_has_a_second():
     rooms = [problem("a"), problem("b"), problem("a", "grouped")]
     budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
-    found = [str(cell) for _, cell in plan(rooms, METHODS, budgets)]
+    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, budgets)]
     assert found == [
         "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
         "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
@@ -48,7 +48,7 @@ def test_every_room_has_its_first_table_before_any_has_a_second():
 
 def test_a_draw_of_a_split_is_the_seed_of_every_method():
     draws = [problem("a", "blocks", draw=n) for n in range(2)]
-    found = [(p.draw, str(cell)) for p, cell in plan(draws, METHODS, [Budget(60, (5, 6))])]
+    found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [Budget(60, (5, 6))])]
     assert found == [
         (0, "a/blocks/gp/any/0"), (1, "a/blocks/gp/any/1"),
         (0, "a/blocks/fast/60/0"), (0, "a/blocks/slow/60/0"),
@@ -60,7 +60,7 @@ def test_a_draw_of_a_split_is_the_seed_of_every_method():
 def test_a_method_takes_part_where_what_it_needs_is_there(needed):
     methods = {"one": Contender("one", ("model=gp",), **{needed: True})}
     problems = [problem("a"), problem("b", **{needed: True})]
-    assert [cell.dataset for _, cell in plan(problems, methods, [])] == ["b"]
+    assert [cell.dataset for _, cell in plan_cells(problems, methods, [])] == ["b"]
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
@@ -71,12 +71,20 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
 
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
-    for contender in named("methods", Contender, config["methods"]).values():
+    for contender in read_entries("methods", Contender, config["methods"]).values():
         assert compose(*contender.overrides(60)).model
     assert config["ours"] in config["methods"]
-    for split in named("splits", SplitChoice, config["splits"]).values():
+    for split in read_entries("splits", SplitChoice, config["splits"]).values():
         assert set(split.datasets) <= set(config["datasets"])
         assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
+
+
+def test_one_model_of_a_network_was_fitted_under_four_names():
+    """Sectors are learned together whatever `gsparc_together`, `gaussians`, `residual` ask for."""
+    methods = read_entries("methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"])
+    network = problem("city", kind="rssi", stations=True, network=True)
+    there = {cell.method for _, cell in plan_cells([network], methods, [Budget(60, (0,))])}
+    assert "gsparc" in there and not there & {"gsparc_together", "gaussians", "residual"}
 
 
 @pytest.mark.parametrize(("group", "of", "entry", "message"), [
@@ -85,11 +93,11 @@ def test_every_method_of_the_default_comparison_composes():
 ])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
-        named(group, of, {"x": entry})
+        read_entries(group, of, {"x": entry})
 
 
 def test_a_split_that_no_budget_names_had_no_row_of_ours():
     rooms = [problem("a"), problem("a", "drawn")]
     budgets = [Budget(60, (0,), ("random",)), Budget(12, (0,), ("grouped",))]
-    found = [str(cell) for _, cell in plan(rooms, METHODS, budgets)]
+    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, budgets)]
     assert "a/drawn/fast/60/0" in found and "a/drawn/fast/12/0" not in found

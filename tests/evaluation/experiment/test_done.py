@@ -19,11 +19,11 @@ from gsparc.evaluation.experiment.done import (
     FAILURE,
     State,
     _checkout,
-    code_of,
-    content,
-    finished,
-    once,
-    text_of,
+    measurements_hash,
+    package_hash,
+    read_finished,
+    run_once,
+    strip_comments,
 )
 from gsparc.evaluation.summary import write_summary
 
@@ -62,19 +62,19 @@ def cut_short(folder, name="last.ckpt"):
     {"program": "q"},
 ])  # fmt: skip
 def test_a_cell_is_done_once_in_one_state(tmp_path, other):
-    assert once(tmp_path, state(), ends(tmp_path, 1)) == once(tmp_path, state(), ends(tmp_path, 2))
-    assert finished(tmp_path, state(**other)) is None
-    assert once(tmp_path, state(**other), ends(tmp_path, 3)) == {"value": 3}
-    assert finished(tmp_path, state()) is None
-    assert once(tmp_path, state(**other), ends(tmp_path, 4), again=True) == {"value": 4}
+    assert run_once(tmp_path, state(), ends(tmp_path, 1)) == run_once(tmp_path, state(), ends(tmp_path, 2))
+    assert read_finished(tmp_path, state(**other)) is None
+    assert run_once(tmp_path, state(**other), ends(tmp_path, 3)) == {"value": 3}
+    assert read_finished(tmp_path, state()) is None
+    assert run_once(tmp_path, state(**other), ends(tmp_path, 4), again=True) == {"value": 4}
     (tmp_path / "summary.json").write_text("{")  # no whole one
-    assert finished(tmp_path, state(**other)) is None
+    assert read_finished(tmp_path, state(**other)) is None
 
 
 def test_another_program_s_result_counts_where_that_is_asked(tmp_path):
-    once(tmp_path, state(), ends(tmp_path, 1))
-    assert once(tmp_path, state(program="q"), ends(tmp_path, 2), reuse=True) == {"value": 1}
-    assert once(tmp_path, state(program="q"), ends(tmp_path, 2)) == {"value": 2}
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    assert run_once(tmp_path, state(program="q"), ends(tmp_path, 2), reuse=True) == {"value": 1}
+    assert run_once(tmp_path, state(program="q"), ends(tmp_path, 2)) == {"value": 2}
 
 
 @pytest.mark.parametrize(
@@ -85,27 +85,27 @@ def test_another_program_s_result_counts_where_that_is_asked(tmp_path):
 def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, name, resumed, again):
     """The same run said again began anew without a word; one that has ended is done again by itself alone."""
     with pytest.raises(KeyboardInterrupt):
-        once(tmp_path, state(), cut_short(tmp_path, name), again=again)
+        run_once(tmp_path, state(), cut_short(tmp_path, name), again=again)
     (tmp_path / FAILURE).write_text("of the first try")
     seen = []
     for _ in range(2):
-        once(tmp_path, state(), ends(tmp_path, 1, seen), again=again)
+        run_once(tmp_path, state(), ends(tmp_path, 1, seen), again=again)
     assert seen == [str(tmp_path / resumed), *([None] * again)] and not (tmp_path / FAILURE).exists()
 
 
 def test_a_checkpoint_of_another_state_is_not_gone_on_from(tmp_path):
     for program in "pq":
         with pytest.raises(KeyboardInterrupt):
-            once(tmp_path, state(program=program), cut_short(tmp_path))
+            run_once(tmp_path, state(program=program), cut_short(tmp_path))
     seen = []
-    once(tmp_path, state(), ends(tmp_path, 1, seen))
+    run_once(tmp_path, state(), ends(tmp_path, 1, seen))
     assert seen == [None]
 
 
 def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_path):
-    once(tmp_path, state(), ends(tmp_path, 1))
+    run_once(tmp_path, state(), ends(tmp_path, 1))
     with pytest.raises(KeyboardInterrupt):
-        once(tmp_path, state(data="e"), cut_short(tmp_path))
+        run_once(tmp_path, state(data="e"), cut_short(tmp_path))
     assert not (tmp_path / "summary.json").exists()
 
 
@@ -113,7 +113,7 @@ def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
     begun = begin(config)
-    return State.of(config, content(begun.module.measurements), begun.split.sha256)
+    return State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
@@ -151,11 +151,11 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     file, read = spectra(tmp_path / "own.npz"), state()
     configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
     unread, same, other = map(State.unread, configs)
-    once(tmp_path, read, ends(tmp_path), unread=unread)
-    assert finished(tmp_path, same) == {"value": 1} and finished(tmp_path, other) is None
+    run_once(tmp_path, read, ends(tmp_path), unread=unread)
+    assert read_finished(tmp_path, same) == {"value": 1} and read_finished(tmp_path, other) is None
     with file.open("ab") as stream:
         stream.write(b" ")
-    assert finished(tmp_path, State.unread(configs[0])) is None
+    assert read_finished(tmp_path, State.unread(configs[0])) is None
     release = compose("dataset=rfid", f"dataset.root='{tmp_path}'", "model=mean")
     before = State.unread(release)
     (tmp_path / "more.txt").touch()
@@ -170,8 +170,8 @@ def test_commits_of_comments_alone_made_every_cell_stale():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
                 node.body[0].value.value = ""
-        assert ast.dump(ast.parse(code_of(text))) == ast.dump(tree), file
-    assert code_of("x = 1  # one\n") == code_of("x = 1\n") != code_of("x = 2\n")
+        assert ast.dump(ast.parse(strip_comments(text))) == ast.dump(tree), file
+    assert strip_comments("x = 1  # one\n") == strip_comments("x = 1\n") != strip_comments("x = 2\n")
 
 
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
@@ -199,12 +199,12 @@ def test_cells_were_current_whose_method_s_own_files_had_changed(tmp_path, monke
         for text in ("VALUE = 1\n", "VALUE = 2\n"):
             module.write_text(text)
             page.write_text(text)
-            hashes.append(text_of("toy_program"))
+            hashes.append(package_hash("toy_program"))
     assert len(set(hashes)) == 4
     page.write_text("other words")
-    assert text_of("toy_program") == hashes[-1]
+    assert package_hash("toy_program") == hashes[-1]
     module.write_text('"""Of a value."""\n\nVALUE = 2  # in metres\n')
-    commented = text_of("toy_program")
+    commented = package_hash("toy_program")
     module.write_text('"""Of another."""\nVALUE = 2\n')
-    assert text_of("toy_program") == commented
+    assert package_hash("toy_program") == commented
     sys.modules.pop("toy_program", None)

@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from releases import real
 
 from gsparc.commands.shared.settings import plain
-from gsparc.evaluation.experiment.problem import problems_of
+from gsparc.evaluation.experiment.problem import load_every_problem
 
 ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
 
@@ -18,12 +18,12 @@ def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     settings = plain(compose("experiment=results/newrf", config="compare"))
     with pytest.raises(ValueError, match="no dataset has a path"):
-        problems_of(settings)
+        load_every_problem(settings)
     (tmp_path / "gsparc/data/newrf").mkdir(parents=True)
     shutil.copy(real(f"releases/newrf/{ROOM}"), tmp_path / "gsparc/data/newrf")
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        problems = problems_of(settings)
+        problems = load_every_problem(settings)
     assert [one.split for one in problems] == ["redrawn"] * 5
     assert {one.draw for one in problems} == set(range(5)) and len(problems[0].data) == 433
     assert "or gsparc data" in caplog.text  # of the other sets

@@ -7,7 +7,7 @@ from hydra import initialize_config_module
 
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
-from gsparc.evaluation.experiment.latency import timed_here
+from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
 from gsparc.models.checkpoint import CheckpointError
 
@@ -19,7 +19,7 @@ def problem(campaign, folds):
 
 def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
     """Times that a comparison had kept stood in tables of other programs' models."""
-    assert timed_here([Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})], {}) == {}
+    assert time_by_dataset([Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})], {}) == {}
 
 
 def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose=()):

@@ -42,7 +42,7 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     monkeypatch.setattr(latency, "FAST", replace(latency.FAST, rounds=12))
     problem = Problem("toy", "random", (), campaign("spectrum", 20), folds(20))
     cells = [Filled(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
-    found = latency.latencies(cells, problem)
+    found = latency.time_queries(cells, problem)
     assert list(found) == list(WAITS)
     assert {name: one.rounds for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
     assert found["slow"].p50_ms == pytest.approx(200, abs=1) and found["quick"].p50_ms < 1

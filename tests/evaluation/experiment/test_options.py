@@ -48,7 +48,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HydraConfig.instance(), "cfg", whole)
         method = build(complete(config.model))
-        reads = options.noting(config, method)
+        reads = options.options_to_note(config, method)
         with heeded.recording(reads):
             data = datamodule(config.dataset).measurements
             split = split_for(plain(config.split), data)
@@ -59,7 +59,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             )  # fmt: skip
             method, rows = fits.methods[0], split.folds[0].test
             method.predict(data.batch(rows[:1]))
-        unused = options.unheeded(reads, method, data) or ""
+        unused = options.warn_of_unheeded(reads, method, data) or ""
         return {one.partition("=")[0] for one in unused.split(", ") if one}, method.predict(
             data.batch(rows)
         ).mean

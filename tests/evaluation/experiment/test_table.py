@@ -8,7 +8,14 @@ from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.fitting import Filled
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.experiment.pictures import draw_budgets
-from gsparc.evaluation.experiment.table import blocks_of, cells_of, markdown, remarks, rows_of, title_of
+from gsparc.evaluation.experiment.table import (
+    average_cells,
+    markdown,
+    remarks,
+    split_by_problem,
+    table_of_cells,
+    title_of,
+)
 
 
 def filled(method, value, seed=None, budget=None, split="random", kind="spectrum", **more):
@@ -32,7 +39,7 @@ TIMED = {"rfid": {"gp": Latency(2.0, 3.0, 1.5, 60), "gsparc": Latency(0.5, 0.6, 
 
 
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
-    found = blocks_of(rows_of(FOUND, TIMED))
+    found = split_by_problem(average_cells(FOUND, TIMED))
     assert [(title_of(block), list(block.method)) for block in found] == [
         ("rfid, split random, 60 s of training per model", ["gp", "gsparc", "gsrf"]),
         ("rfid, split random, 300 s of training per model", ["gp", "gsrf"]),
@@ -51,7 +58,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
         for seed, level in enumerate((5.0, 7.0, 9.0))
         for method, error in (("gp", level), ("idw", level + 1.0 + 0.1 * seed))
     ]
-    (block,) = blocks_of(rows_of(found, {}))
+    (block,) = split_by_problem(average_cells(found, {}))
     gp, idw = block.itertuples()
     assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
     assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(2 / 3**0.5)
@@ -60,13 +67,13 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "| 0.80 |" in page
     assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
-    assert cells_of(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
+    assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
 def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
     there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
     drawn = {"kind": "rssi", "drawn": True}
-    found = rows_of([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
+    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     pictures.draw_splits(found, tmp_path / "city.png")
@@ -74,14 +81,27 @@ def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, mon
     assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
 
 
+def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
+    """The legend drew every mark with an error bar, also of points without one."""
+    figures = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    draw_budgets(average_cells(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
+    (legend,) = figures[0].legends
+    marks = {
+        text.get_text(): line.get_marker()
+        for text, line in zip(legend.texts, legend.get_lines(), strict=True)
+    }
+    assert marks == {name: pictures.style_of(name).mark for name in ("gp", "gsparc", "gsrf")}
+
+
 def test_losers_are_not_hidden():
-    said = " | ".join(remarks(blocks_of(rows_of(FOUND, TIMED))[0], "gsparc"))
+    said = " | ".join(remarks(split_by_problem(average_cells(FOUND, TIMED))[0], "gsparc"))
     assert "first: gp" in said and "a simple baseline wins: take gp" in said
     assert "gsparc is 0.50 dB behind gp, within the seeds' spread" in said
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
     assert "busy (load up to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
-    said = " | ".join(remarks(blocks_of(rows_of(far, {}))[0], "gsparc"))
+    said = " | ".join(remarks(split_by_problem(average_cells(far, {}))[0], "gsparc"))
     assert "2.00 dB behind gp" in said and "spread" not in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
@@ -92,20 +112,20 @@ def test_the_smaller_error_may_have_the_worse_outages():
         filled(name, error, 0, kind="rssi", **{"test/outage/brier": outage})
         for name, error, outage in (("kriging", 7.0, 0.028), ("gsparc", 7.3, 0.015))
     ]
-    said = " | ".join(remarks(blocks_of(rows_of(found, {}))[0], "gsparc"))
+    said = " | ".join(remarks(split_by_problem(average_cells(found, {}))[0], "gsparc"))
     assert "kriging predicts outages worse: Brier score 0.0280, of gsparc 0.0150" in said
 
 
 def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 60.0, earlier="0123abcd")
-    found = blocks_of(rows_of([*FOUND[:1], old], {}))[0]
+    found = split_by_problem(average_cells([*FOUND[:1], old], {}))[0]
     assert list(found.earlier) == ["", "0123abcd"]
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
 
 def test_page_sheet_and_picture_show_every_method(tmp_path):
-    found = rows_of(FOUND, TIMED)
-    page = markdown(blocks_of(found), "gsparc")
+    found = average_cells(FOUND, TIMED)
+    page = markdown(split_by_problem(found), "gsparc")
     assert "### rfid, split random, 60 s of training per model" in page
     assert "**29.50 ± 0.71**" in page and "| gsrf | 21.00 ± 1.41 | 0.9 |" in page
     draw_budgets(found, tmp_path / "compare.png", "gsparc")
@@ -115,5 +135,5 @@ def test_page_sheet_and_picture_show_every_method(tmp_path):
 def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
     found = [filled("gp", 30.0, i, 60.0, **{"model/label": label}) for i, label in enumerate(labels)]
-    (block,) = blocks_of(rows_of(found, {}))
+    (block,) = split_by_problem(average_cells(found, {}))
     assert list(block.label) == [" (Vecchia 30)"] and "gp (Vecchia 30)" in markdown([block], "gsparc")

@@ -9,9 +9,9 @@ from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
-from gsparc.evaluation.drawing import look
+from gsparc.evaluation.drawing import style_of
 from gsparc.evaluation.report import plots
-from gsparc.evaluation.report.page import html, studies, warnings
+from gsparc.evaluation.report.page import make_sections, render_html, warnings
 from gsparc.evaluation.report.runs import find_runs
 
 arguments = COMMANDS["report"].arguments
@@ -52,17 +52,17 @@ def test_the_page_fetches_nothing(written):
 
 def test_what_a_run_is_called_cannot_become_a_script(run_dir, tmp_path):
     run_dir(tmp_path / "x", name="<script>alert(1)</script>")
-    text = html("<b>", "now", studies(find_runs([tmp_path / "x"])))
+    text = render_html("<b>", "now", make_sections(find_runs([tmp_path / "x"])))
     assert "<script>alert" not in text and "<b>" not in text
 
 
 def test_every_plot_is_a_whole_drawing(three):
     runs = find_runs(three)
-    for draw in (plots.pareto, plots.accuracy_cdf):
+    for draw in (plots.draw_pareto, plots.draw_accuracy_cdf):
         figure = draw(runs)
-        assert ElementTree.fromstring(plots.svg(figure)).tag.endswith("svg")
+        assert ElementTree.fromstring(plots.to_svg(figure)).tag.endswith("svg")
         title = figure.get_label()
-        assert title and title not in plots.svg(figure)
+        assert title and title not in plots.to_svg(figure)
 
 
 def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
@@ -70,10 +70,10 @@ def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
     for name in ("gsparc", "gp"):
         run_dir(tmp_path / name, name=name)
     runs = find_runs([tmp_path])
-    axes = plots.accuracy_cdf(runs).axes[0]
+    axes = plots.draw_accuracy_cdf(runs).axes[0]
     assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
     colours = {to_hex(one.get_color()).upper() for one in axes.lines if one.get_label() in ("gsparc", "gp")}
-    assert colours == {look(name).colour for name in ("gsparc", "gp")}
+    assert colours == {style_of(name).colour for name in ("gsparc", "gp")}
 
 
 def test_a_busy_machine_is_said_once(three):

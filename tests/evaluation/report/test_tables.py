@@ -6,11 +6,13 @@ import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gsparc.evaluation.report import tables
-from gsparc.evaluation.report.plots import short
-from gsparc.evaluation.report.runs import Run, distinct_overrides, find_runs, read_columns
-from gsparc.evaluation.report.table import Column, Interval, Table, bootstrap, interval
+from gsparc.evaluation.report.plots import shorten_setting
+from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs, read_columns
+from gsparc.evaluation.report.tables import bootstrap_interval, interval_of_figure
+from gsparc.evaluation.table import Column, Interval, Table
 
 
 def cells(table, row: int) -> dict:
@@ -22,11 +24,11 @@ def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     assert [run.folder.name for run in runs] == ["a0", "a1", "b0"] and find_runs(three[:1])[0].facts[
         "seed"
     ] == 0
-    assert [run.setting for run in distinct_overrides(runs)] == ["gsparc emission.hidden=8"] * 2 + [
+    assert [run.setting for run in drop_shared_overrides(runs)] == ["gsparc emission.hidden=8"] * 2 + [
         "gsparc emission.hidden=64"
     ]
-    assert {run.setting for run in distinct_overrides(runs[:2])} == {"gsparc"}
-    assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
+    assert {run.setting for run in drop_shared_overrides(runs[:2])} == {"gsparc"}
+    assert list(tables.group_by_setting(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
 
 
 @pytest.mark.parametrize(("folder", "text", "message"), [
@@ -44,7 +46,7 @@ def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
 
 
 def test_results_have_accuracy_beside_time_memory_and_origin(three):
-    table = tables.results(find_runs(three))
+    table = tables.table_of_results(find_runs(three))
     row = cells(table, 0)
     assert row["PSNR dB"].value == 28.0 and row["PSNR dB"].low < 28.0 < row["PSNR dB"].high
     assert row["train s/fold"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
@@ -56,7 +58,7 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
 
 
 def test_seeds_are_put_together_with_their_spread(three):
-    table = tables.seeds(find_runs(three))
+    table = tables.table_of_seeds(find_runs(three))
     found = cells(table, 0)["PSNR dB"]
     assert (found.value, found.low, found.high) == (pytest.approx(28.2), 28.0, 28.4)
     assert cells(table, 0)["seeds"] == 2 and cells(table, 1)["PSNR dB"] == Interval(29.5)
@@ -66,20 +68,20 @@ def test_an_interval_covers_as_often_as_it_says():
     draw = np.random.default_rng(0)
     hits = 0
     for _ in range(100):
-        low, high = bootstrap(draw.normal(5, 2, 40))
+        low, high = bootstrap_interval(draw.normal(5, 2, 40))
         hits += low < 5 < high
     assert 86 <= hits <= 100
 
 
 def test_an_interval_of_a_ratio_weighs_samples(three):
-    low, high = bootstrap(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
+    low, high = bootstrap_interval(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
     assert low == high == pytest.approx(0.1)
-    assert interval(find_runs(three)[0].row, "no_such_figure") is None
+    assert interval_of_figure(find_runs(three)[0].row, "no_such_figure") is None
 
 
 def test_the_worst_receivers_are_the_worst(three):
     runs = find_runs(three[:1])
-    table = tables.worst(runs)
+    table = tables.table_of_worst(runs)
     values = [row[4] for row in table.rows]
     assert values == sorted(runs[0].samples["psnr_db"])[:3]
     assert table.rows[0][5] == pytest.approx(values[0] - 0.5)  # the Gaussian process at the same place
@@ -92,7 +94,7 @@ def test_a_table_survives_csv_and_markdown():
     assert rows[0] == {"name": "a|b", "x": "1.25", "x low": "1.0", "x high": "2.0", "n": "3"}
     assert rows[1]["x"] == ""
     text = table.markdown()
-    assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | – | – |" in text and "note" in text
+    assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | - | - |" in text and "note" in text
 
 
 def test_columns_keep_text_as_text(tmp_path):
@@ -110,9 +112,20 @@ def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
 
 def test_labels_keep_the_value_that_tells_settings_apart():
     """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
-    said = [short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
+    said = [
+        shorten_setting(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)
+    ]
     assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
-    assert short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and short("gp") == "gp"
+    assert shorten_setting("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and shorten_setting("gp") == "gp"
+
+
+def test_labels_of_sweeps_lost_true_and_false_on_the_console():
+    settings = [f"gsparc-paper model.attenuation.inverse_distance={on}" for on in (True, False)]
+    columns = [Column("method and setting", ""), *(Column(f"figure {n} dB") for n in range(8))]
+    console = Console(width=100, record=True, file=io.StringIO(), soft_wrap=True)
+    console.print(Table("", columns, [[one, *[Interval(1.0, 0.5, 1.5)] * 8] for one in settings]))
+    first = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines() if "│" in line)
+    assert all(one.replace(" ", "") in first.replace(" ", "") for one in settings)
 
 
 def test_settings_of_several_models_were_told_for_each(tmp_path):
@@ -121,5 +134,5 @@ def test_settings_of_several_models_were_told_for_each(tmp_path):
         Run(tmp_path, {"model/name": str(i)}, config={**kind, "init.count": i})
         for i, kind in enumerate(kinds)
     ]
-    told = "".join(tables.differing(runs).values())
+    told = "".join(tables.differing_settings(runs).values())
     assert "init.count=1" in told and "model.x" not in told and "model._target_" not in told

@@ -14,7 +14,7 @@ from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split, hash_indices
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.scores import score_methods
 from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
@@ -140,7 +140,7 @@ def test_it_beats_neighbours(known_campaign, small, tmp_path):
     assert report.seconds > 0 and (folder / "array_recovery.csv").exists()
     nearest = method_class("nearest")()
     nearest.fit(data, split.folds[0], FitContext(tmp_path))
-    ours, theirs = (score([m], data, split) for m in (method, nearest))
+    ours, theirs = (score_methods([m], data, split) for m in (method, nearest))
     assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
 
 
@@ -218,7 +218,7 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
             methods = [kind() for _ in split.folds]
             for method, fold in zip(methods, split.folds, strict=True):
                 method.fit(data, fold, FitContext(tmp_path))
-            scores.append(score(methods, data, split))
+            scores.append(score_methods(methods, data, split))
         ahead[name] = [
             (scores[0].samples[k] - scores[1].samples[k]).mean() for k in ("ssim_gauss", "psnr_db")
         ]

@@ -11,7 +11,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
 from gsparc.data.query import Query
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, choose_kernel, principal_components
 from gsparc.ops import Pose
 from gsparc.processes.density import LeftOutDensity
@@ -114,6 +114,6 @@ def test_metric_formats_on_the_real_subset(real_rfid, tmp_path):
     split = split_for({"name": "random"}, data)
     gp = GaussianProcess()
     gp.fit(data, split.folds[0], FitContext(tmp_path))
-    figures = score([gp], data, split).figures()
+    figures = score_methods([gp], data, split).figures()
     assert figures["ssim_gauss"] == pytest.approx(0.927, abs=0.002)
     assert figures["psnr_db"] == pytest.approx(28.9, abs=0.2)

@@ -13,7 +13,7 @@ from scenes import error
 
 from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.evaluation.experiment.study import with_direction_errors
+from gsparc.evaluation.experiment.study import add_direction_errors
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
@@ -149,7 +149,7 @@ def test_paths_sum_to_the_prediction(pillar):
 def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
     """Directions taken as exact left NMSE 0.08, 0.45 and 0.70."""
     data, fold, sources = directed(60, pillar=True)
-    method, note = fitted(with_direction_errors(data, degrees, seed=0), fold)
+    method, note = fitted(add_direction_errors(data, degrees, seed=0), fold)
     assert error(method, data, fold.test) < (0.07 if degrees < 2 else 0.25)
     estimated = float(note.partition("error ")[2].partition(" degrees")[0])
     assert abs(estimated / degrees - 1) < 0.3
@@ -160,7 +160,7 @@ def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
 
 def test_missing_and_spurious_rays_neither_add_nor_remove_sources():
     data, fold, _ = directed(60, pillar=True)
-    method, note = fitted(with_direction_errors(data, 1.0, seed=1, missing=0.1, false=0.1), fold)
+    method, note = fitted(add_direction_errors(data, 1.0, seed=1, missing=0.1, false=0.1), fold)
     assert method.size() == 7 and " 0 visibility entries" not in note
     assert error(method, data, fold.test) < 0.08  # rays alone: 0.17
 

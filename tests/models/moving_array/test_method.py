@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from gsparc.data.query import Query
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.evaluation.scores import score
+from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, nonnegative_powers
@@ -80,7 +80,7 @@ def test_a_search_ends_with_its_seconds():
 def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted, tmp_path):
     rival = GaussianProcess()
     rival.fit(data, split.folds[0], FitContext(tmp_path))
-    ours, theirs = (score((m,), data, split, "test") for m in (fitted, rival))
+    ours, theirs = (score_methods((m,), data, split, "test") for m in (fitted, rival))
     assert ours.figures()["psnr_db"] > theirs.figures()["psnr_db"] + 0.5 and fitted.size() > 5
     assert 0.4 < ours.variance.mean() / ours.samples["mse"].mean() < 2.5
     assert ours.confidence.min() > 0 and ours.confidence.max() < 1

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.evaluation.drawing import look
-from gsparc.evaluation.experiment.tradeoff import Other, beaten_by, draw_front
+from gsparc.evaluation.drawing import style_of
+from gsparc.evaluation.experiment.tradeoff import beaten_by, draw_front
 from gsparc.models.pareto import Point, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
@@ -37,9 +37,13 @@ def test_settings_are_said_in_words():
     )
 
 
+def other(psnr_db: float, ms: float) -> Point:
+    return Point("a baseline", {}, 1, {"psnr_db": psnr_db}, np.nan, np.full(3, ms))
+
+
 def test_a_point_that_another_method_beats_is_said():
     point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
-    others = {"nearest": Other(26.0, 0.5, 0.6), "gp": Other(29.0, 2.0, 3.0), "mean": Other(15.0, 0.1, 0.1)}
+    others = {"nearest": other(26.0, 0.5), "gp": other(29.0, 2.0), "mean": other(15.0, 0.1)}
     assert beaten_by(point, others, "psnr_db") == "nearest"
     assert beaten_by(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
 
@@ -48,11 +52,13 @@ def test_settings_of_points_were_cut_at_the_edge_of_the_picture():
     """Beside the axes; and baselines had the colour that is gsparc's elsewhere."""
     said = worded({"keep": 0.12, "stride": 5, "confidence": False}) + ", 1 thread"
     points = [Point(said, {}, 1, {"psnr_db": 30.0 + ms}, 20.0, np.full(3, float(ms))) for ms in range(1, 9)]
-    others = {"nearest": Other(40.0, 0.5, 0.6)}
+    others = {"nearest": other(40.0, 0.5)}
     figure = draw_front(points, range(8), others, "psnr_db", "gsparc", "a title")
     figure.canvas.draw()
     axes, legend = figure.axes
     box = legend.texts[0].get_window_extent()
     assert box.x0 >= 0 and box.x1 <= figure.bbox.x1 and 0 <= box.y0 <= box.y1 <= axes.bbox.y0
     assert "nearest is better" in legend.texts[0].get_text()
-    assert {look(name).colour for name in ("gsparc", "nearest")} <= {line.get_color() for line in axes.lines}
+    assert {style_of(name).colour for name in ("gsparc", "nearest")} <= {
+        line.get_color() for line in axes.lines
+    }

@@ -12,8 +12,8 @@ from gsparc.commands.train import train
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
-from gsparc.evaluation.baselines import baseline
-from gsparc.evaluation.scores import score, unseen_runs
+from gsparc.evaluation.baselines import fit_baseline
+from gsparc.evaluation.scores import score_methods, unseen_runs
 from gsparc.models import loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction
@@ -50,7 +50,10 @@ def test_both_ends_may_move_in_channels():
     split = split_for({"name": "random"}, data)
     method = Gsparc().made_for(data)
     method.fit(data, split.folds[0], FitContext(budget_s=5.0, budget_clock="processor"))
-    own, plain = score([method], data, split).figures(), baseline("gp", data, split).scores.figures()
+    own, plain = (
+        score_methods([method], data, split).figures(),
+        fit_baseline("gp", data, split).scores.figures(),
+    )
     assert own["nmse"] < 0.9 * plain["nmse"] and "direct" in method.effects
 
 
@@ -74,8 +77,8 @@ def test_runs_that_were_not_learned_from_are_scored_after_their_best_phase():
     fold = split.folds[0]
     assert len(unseen_runs(data, fold, "test")) == 1 and not len(unseen_runs(data, fold, "train"))
     method = Turned(data, 1.0)
-    assert score([method], data, split).figures()["nmse"] < 1e-10
-    known = score([method], data, split, "train").figures()["nmse"]
+    assert score_methods([method], data, split).figures()["nmse"] < 1e-10
+    known = score_methods([method], data, split, "train").figures()["nmse"]
     assert known == pytest.approx(abs(np.exp(1j) - 1) ** 2, rel=1e-4)  # a known run's phase is to be known
 
 

@@ -1,0 +1,169 @@
+"""A table once: values under headings, as a console shows them, in Markdown, as CSV or as cells of a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pandas as pd
+from rich.table import Table as RichTable
+
+Row = Mapping[str, Any]  # of results, see `results.rows_of`
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value and its interval.
+
+    Attributes:
+        value: the figure.
+        low, high: ends of the interval; None when unknown.
+        error: standard deviation or error that is shown instead.
+    """
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    error: float | None = None
+
+    @property
+    def bars(self) -> list[list[float]]:
+        """Lengths of error bars below and above, (2, 1)."""
+        ends = (self.value if end is None else end for end in (self.low, self.high))
+        return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
+
+    def text(self, form: str = ".2f") -> str:
+        """`29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
+        ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
+        error = "" if self.error is None or math.isnan(self.error) else f" ± {self.error:{form}}"
+        return f"{format_number(self.value, form)}{ends}{error}"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A heading, and what stands below it.
+
+    Attributes:
+        name: as shown, with its unit.
+        form: how numbers are written; empty of words, which are aligned left.
+        note: what it means, for a reader who points at it.
+        of: a result's value: a column of the results, or a function; unused where rows are given.
+    """
+
+    name: str
+    form: str = ".4g"
+    note: str = ""
+    of: str | Callable[[Row], Any] = ""
+
+    def value(self, row: Row) -> Any:
+        """Return what a result has in this column: text, a number, an interval or None."""
+        return row.get(self.of) if isinstance(self.of, str) else self.of(row)
+
+    def text(self, value: Any) -> str:
+        """Return a cell as text."""
+        if isinstance(value, Interval):
+            return value.text(self.form)
+        return (
+            format_number(value, self.form)
+            if value is None or isinstance(value, (int, float))
+            else str(value)
+        )
+
+
+# Of all tables of results; seconds are means over folds, each of which trains a model.
+TRAIN = Column("train s/fold", ".3g", of="train_s")
+CPU = Column("cpu s/fold", ".3g", of="train_cpu_s")
+P50 = Column("query ms p50", ".3g", of="query_ms")
+P95 = Column("p95", ".3g", of="query_p95_ms")
+
+
+def value_with_error(name: str, error: str) -> Callable[[Row], Interval]:
+    """Return what makes `value ± error` of two columns of the results."""
+    return lambda row: Interval(row[name], error=row[error])
+
+
+@dataclass
+class Table:
+    """Rows under headings.
+
+    Attributes:
+        title: above it.
+        columns: headings.
+        rows: values: text, numbers, intervals or None.
+        note: what to know before reading it.
+        bold: first cell of a row that is emphasised.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Any]] = field(default_factory=list)
+    note: str = ""
+    bold: str | None = None
+
+    @classmethod
+    def of(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: str) -> Table:
+        """Return a row per result; `more` are `note` and `bold`."""
+        return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
+
+    @classmethod
+    def of_texts(
+        cls, title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]
+    ) -> Table:
+        """Return a table of cells that are written already: columns of `words`, then of `numbers`."""
+        return cls(title, [*(Column(name, "") for name in words), *map(Column, numbers)], [*rows])
+
+    def without(self, *names: str) -> Table:
+        """Return the same but for some columns."""
+        kept = [i for i, column in enumerate(self.columns) if column.name not in names]
+        rows = [[row[i] for i in kept] for row in self.rows]
+        return Table(self.title, [self.columns[i] for i in kept], rows, self.note, self.bold)
+
+    @staticmethod
+    def key(value: Any) -> str:
+        """Return what a cell is sorted by."""
+        value = getattr(value, "value", value)
+        return "" if value is None else str(value)
+
+    def texts(self) -> tuple[list[str], list[list[str]]]:
+        """Return heads and cells as text."""
+        rows = [[c.text(value) for c, value in zip(self.columns, row, strict=True)] for row in self.rows]
+        return [column.name for column in self.columns], rows
+
+    def csv(self) -> str:
+        """Comma-separated, an interval as three columns."""
+        parts: dict[str, list[Any]] = {}
+        for number, column in enumerate(self.columns):
+            cells = [row[number] for row in self.rows]
+            parts[column.name] = [getattr(cell, "value", cell) for cell in cells]
+            if any(isinstance(cell, Interval) for cell in cells):
+                for end in ("low", "high"):
+                    parts[f"{column.name} {end}"] = [getattr(cell, end, None) for cell in cells]
+        # object: pandas would write whole numbers beside empty cells as 3.0.
+        return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
+
+    def markdown(self) -> str:
+        """Return a Markdown table under its title."""
+        heads, rows = self.texts()
+        # A bar inside a cell would end it.
+        rows = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+        rows = [[f"**{cell}**" for cell in row] if row[0] == self.bold else row for row in rows]
+        rule = "|---" + "".join("|---:" if column.form else "|---" for column in self.columns[1:]) + "|"
+        first, *lines = (f"| {' | '.join(cells)} |" for cells in (heads, *rows))
+        note = f"\n{self.note}\n" if self.note else ""
+        return f"### {self.title}\n{note}\n" + "\n".join([first, rule, *lines]) + "\n"
+
+    def __rich__(self) -> RichTable:
+        """Return what a console shows; words are broken where they are wider than it, never cut."""
+        result, (heads, rows) = RichTable(title=self.title, caption=self.note or None), self.texts()
+        for column, head in zip(self.columns, heads, strict=True):
+            result.add_column(head, justify="right" if column.form else "left", overflow="fold")
+        for row in rows:
+            result.add_row(*row, style="bold" if row[0] == self.bold else None)
+        return result
+
+
+def format_number(value: float | None, form: str) -> str:
+    """Return a number in a format, or a dash where there is none or NaN."""
+    return "-" if value is None or math.isnan(value) else format(value, form)
