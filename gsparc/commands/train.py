@@ -34,7 +34,7 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import State, content, finished, once, program
+from gsparc.evaluation.experiment.done import State, content, finished, program, recorded
 from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
@@ -148,8 +148,8 @@ def train(
             whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
-                # `Method.fit` of every fold. For gradient steps `run_stage` (field/gradient_stage.py) makes
-                # the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                # `Method.fit` of every fold; what takes gradient steps (models/splat/method.py) makes the
+                # Trainer of `config.trainer` there and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(method, data, split, contexts, keep=keep)
                 # Some options are read by answers alone: one query, before unused options are listed.
@@ -339,7 +339,7 @@ def _draw(
 
 
 def task(config: DictConfig) -> float:
-    """Train as configured and show the table; a job of a multirun is done once, see `once`.
+    """Train as configured and show the table; a job of a multirun that is done is not done again.
 
     Returns:
         The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
@@ -352,13 +352,20 @@ def task(config: DictConfig) -> float:
     with locked(run_dir / ".job"):  # the run's own is its training's
         unread = State.unread(config) if job else None
         facts = finished(run_dir, unread, config.reuse) if unread else None
+        if facts is None:
+            begun = begin(config)
+            state = State.of(config, content(begun.module.measurements), begun.split.sha256)
+            facts = finished(run_dir, state, config.reuse) if job else None
         if facts is not None:
             log.info("%s: was done before", run_dir)
         else:
-            begun = begin(config)
-            state = State.of(config, content(begun.module.measurements), begun.split.sha256)
-            work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
-            facts = once(run_dir, state, work, unread=unread, **how)
+            with recorded(run_dir, state, unread) as left:
+                config.ckpt_path = config.ckpt_path or left
+                facts, objects = train(config, run_dir, begun)
+                made = f"{objects.data.site.name}, split {objects.split.name}"
+                title = f"{made}, {config.eval_on}, seed {config.seed}"
+                table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
+                show(run_dir, table, lines=summary.remarks(facts, config.eval_on))
     figure = DECIDING[facts["dataset/kind"]]
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
@@ -367,15 +374,6 @@ def task(config: DictConfig) -> float:
     if job and hydra.runtime.choices["hydra/sweeper"] != "basic":
         raise ValueError(f"{config.eval_on}/{figure}: these data do not tell what the search improves")
     return math.nan  # only a search asks for it
-
-
-def _train_and_show(config: DictConfig, begun: Begun, left: str | None) -> None:
-    """Train, from what an interrupted try has left where nothing else is said."""
-    run_dir, config.ckpt_path = run_directory(), config.ckpt_path or left
-    facts, objects = train(config, run_dir, begun)
-    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-    show(run_dir, results, lines=summary.remarks(facts, config.eval_on))
 
 
 def main() -> None:

@@ -8,7 +8,8 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
 from importlib.metadata import distribution, packages_distributions
@@ -115,7 +116,6 @@ def once(
     state: State,
     work: Callable[[str | None], object],
     *,
-    unread: State | None = None,
     reuse: bool = False,
     again: bool = False,
 ) -> dict[str, Any]:
@@ -124,9 +124,7 @@ def once(
     Args:
         folder: the cell's own, held by the caller.
         state: of the cell.
-        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
-            interrupted try has left, None to begin anew.
-        unread: the same state, by which it is found done before its data are read.
+        work: does it, and writes the summary; is given what `recorded` yields.
         reuse: see `finished`.
         again: one that is done is done anew.
 
@@ -137,6 +135,26 @@ def once(
     if facts is not None:
         log.info("%s: already done", folder)
         return facts
+    with recorded(folder, state) as left:
+        work(left)
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
+
+
+@contextmanager
+def recorded(folder: Path, state: State, unread: State | None = None) -> Iterator[str | None]:
+    """Record when a cell begins, and that it has ended where nothing is raised.
+
+    Args:
+        folder: the cell's own, held by the caller.
+        state: of the cell.
+        unread: the same state, by which it is found done before its data are read.
+
+    Yields:
+        The checkpoint, or folder, of the same state that an interrupted try has left; None to begin anew.
+    """
     record = read_summary(folder / RECORD)
     left = None
     if record is None or record.get("ended") or not state.same(record):
@@ -146,12 +164,8 @@ def once(
     else:
         left = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
-    work(left)
+    yield left
     _write(folder / RECORD, {**record, "ended": True})
-    facts = read_summary(folder / SUMMARY)
-    if facts is None:
-        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
-    return facts
 
 
 def program(settings: Any) -> str:

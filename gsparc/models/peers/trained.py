@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.gradient_stage import run_stage, steps_asked_for
+from gsparc.field.gradient_stage import interruptible, make_trainer, read_result, steps_asked_for
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
 from gsparc.field.module import NetworkModule
@@ -170,11 +170,15 @@ class TrainedPeer(Method):
         own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
         module = self.module(max(round(own), 1) if asked is None else asked, context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
-        ran = run_stage(module, data, Fold(rows, rows[:0], fold.test), context, files, budget)
-        self.steps = ran.taken
+        all_rows = Fold(rows, rows[:0], fold.test)
+        trainer, batches = make_trainer(module, data, all_rows, context, files, budget)
+        with interruptible(trainer, batches):
+            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
+        result = read_result(trainer, budget)
+        self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        limited_by = less_repeatable(budget.limited_by, "wall" if ran.timed_out else None)
+        limited_by = less_repeatable(budget.limited_by, "wall" if result.timed_out else None)
         return FitReport(budget.counted.wall, (note,), limited_by)
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:

@@ -23,6 +23,7 @@ from gsparc.evaluation.experiment.done import (
     content,
     finished,
     once,
+    recorded,
     text_of,
 )
 from gsparc.evaluation.summary import write_summary
@@ -151,7 +152,8 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     file, read = spectra(tmp_path / "own.npz"), state()
     configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
     unread, same, other = map(State.unread, configs)
-    once(tmp_path, read, ends(tmp_path), unread=unread)
+    with recorded(tmp_path, read, unread) as left:
+        ends(tmp_path)(left)
     assert finished(tmp_path, same) == {"value": 1} and finished(tmp_path, other) is None
     with file.open("ab") as stream:
         stream.write(b" ")
