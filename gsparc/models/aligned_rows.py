@@ -25,6 +25,7 @@ from scipy.spatial.distance import cdist
 from gsparc.data.moments import Snapshots, moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.target_rows import TINY_POWER
 from gsparc.physics.row_factors import Freedom, turning, words
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel
@@ -81,7 +82,7 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
             # Where gains are free rows have no level of their own: all are learned at unit power.
-            level = np.maximum(_rms(rows.values), 1e-30)[rows.moment]
+            level = _rms(rows.values)[rows.moment]
             factors = factors / level[:, None, None]
             if noise is not None:
                 noise = np.array(noise)
@@ -133,9 +134,9 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Root mean square (n,) of what was measured in rows (n, A, K)."""
+    """Root mean square (n,) of what was measured in rows (n, A, K), above 0."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
-    return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
+    return np.maximum(np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count), TINY_POWER)
 
 
 # Of the last alignment the measurements, what else it depends on, and its result: baselines share it.
@@ -150,7 +151,7 @@ def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
-        values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
+        values = values / _rms(values)[:, None, None]
     length = site.wavelength or SPACINGS * spacing(rows.places)
     one = _Rows(rows.places, values, rows.tones, freedom, length)
     found = [one.smooth(one.along_tree(None))]

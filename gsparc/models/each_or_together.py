@@ -20,7 +20,7 @@ from gsparc.models.per_station import of_station
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.network import network_of
-from gsparc.models.target_rows import heard
+from gsparc.models.target_rows import decibels, heard
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
@@ -82,7 +82,7 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
         joint.fit(data, Fold(learned, learned[:0], learned[:0]), own)
         rows = np.concatenate([part for part, _ in parts])
         separate = torch.cat([powers for _, powers in parts])
-        target = _decibels(data.batch(rows).target)
+        target = decibels(data.batch(rows).target.flatten().double())
         errors.append([(_levels(joint, data, rows) - target).square(), (separate - target).square()])
         if budget.over():
             break
@@ -111,8 +111,4 @@ def _by_station(
 
 @torch.no_grad()
 def _levels(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
-    return _decibels(method.predict(data.batch(rows)).mean)
-
-
-def _decibels(power: Tensor) -> Tensor:
-    return 10 * power.flatten().double().clamp_min(1e-30).log10()
+    return decibels(method.predict(data.batch(rows)).mean.flatten().double())

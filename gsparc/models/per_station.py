@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
+from gsparc.data.errors import some
 from gsparc.data.executor import each, elsewhere
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -195,14 +196,13 @@ class PerStation(Method):
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         known, unheard = trained_stations(self.factory, data, fold)
+        names = some([stations.name[t] for t in np.flatnonzero(unheard)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
             if not self.factory.both_ends and not joint:
-                names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
         if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
-            names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
             needs = f"{self.name}: places of stations are unknown, it needs them"
             if together:
                 raise ValueError(f"{needs}; say stations=each")
@@ -282,8 +282,7 @@ class PerStation(Method):
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
         # One pose may stand for all rows.
-        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3)
-        ends = query.tx if self.site.static_end == "tx" else receiver
+        ends = query.tx if self.site.static_end == "tx" else query.rx.position.expand_as(query.tx)
         table = torch.from_numpy(self.site.stations.position)
         # A station at an unknown place is nearest to none: NaN would be the least of every row.
         distance = torch.cdist(ends.detach().cpu().double(), table).nan_to_num(math.inf)
@@ -295,7 +294,7 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())
-            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
+            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}")
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
 
     def state(self) -> dict[str, Any]:

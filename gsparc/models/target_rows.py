@@ -13,6 +13,7 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.processes.powers import Rows
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
+DECIBELS_PER_NAT = 10 / math.log(10)
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -47,6 +48,11 @@ def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
     return rows / np.float32(255) if target.dtype == np.uint8 else rows
 
 
+def decibels(power: Tensor) -> Tensor:
+    """Return powers in decibels, of none the least that has a logarithm."""
+    return 10 * power.clamp_min(TINY_POWER).log10()
+
+
 def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
     """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
     if kind == "csi":
@@ -63,7 +69,7 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     if kind == "csi":
         return 2 * variance
     if kind == "rssi":
-        return variance * (math.log(10) / 10 * mean.flatten(1).mean(1)) ** 2
+        return variance * (mean.flatten(1).mean(1) / DECIBELS_PER_NAT) ** 2
     return variance
 
 

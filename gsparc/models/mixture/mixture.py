@@ -262,10 +262,9 @@ class Mixture(LearnsTogether, ClosedForm):
         made = [(weight, one) for weight, one in self.parts() if isinstance(one, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
-        result = [(weight, method.paths(query)) for weight, method in made]
-        gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
-        delay = torch.cat([one[1] for _, one in result], dim=2)
-        unit, carrier = torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
+        gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
+        gain = torch.cat([weight * own for (weight, _), own in zip(made, gains, strict=True)], dim=2)
+        delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
         return *each_once(gain, delay, unit, carrier), carrier
 
     # -- what it is made of --------------------------------------------------------------------------

@@ -17,13 +17,13 @@ from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.schema import Site
+from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER, decibels
 
 LEAST_HELD = 4  # rows, for weights to mean anything
 LEAST_GAIN_DB = 0.2  # for which a query may take several times as long
 FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
-UNUSED = 0.05  # weight below which a predictor is left out
+UNUSED = 0.05  # weight below which a predictor is left out of a mixture
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
-LEAST_WEIGHT = 0.05  # of a prediction in a mixture, below which it is left out
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
@@ -75,7 +75,7 @@ def share_of_second(parts: Sequence[Rows]) -> float:
     if len(first) < FEW_ROWS and abs(gain) < 2 * unsure:
         return 0.5
     means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
-    if means[0] <= means[-1] and 10 / np.log(10) * (means[0] - min(means)) < LEAST_GAIN_DB:
+    if means[0] <= means[-1] and DECIBELS_PER_NAT * (means[0] - min(means)) < LEAST_GAIN_DB:
         return 0.0
     best = float(SHARES[int(np.argmin(means))])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
@@ -84,26 +84,26 @@ def share_of_second(parts: Sequence[Rows]) -> float:
 def error(predicted: Tensor, target: Tensor) -> float:
     """Return the share of the target's energy that is missed."""
     missed = (predicted - target).abs().square().sum()
-    return float(missed / target.abs().square().sum().clamp_min(1e-30))
+    return float(missed / target.abs().square().sum().clamp_min(TINY_POWER))
 
 
 def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
     """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
     middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
-    whole = (target - middle).abs().square().sum().clamp_min(1e-30)
+    whole = (target - middle).abs().square().sum().clamp_min(TINY_POWER)
     return 1 - float((predicted - target).abs().square().sum() / whole)
 
 
 def comparable(values: Tensor, site: Site) -> Tensor:
     """Return values in the unit that errors are counted in: powers in decibels."""
-    return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
+    return decibels(values) if site.kind == "rssi" else values
 
 
 def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
     """Return the mean (n, ...) of two predictions in the unit of `comparable`, the other's of this weight."""
     if site.kind != "rssi":
         return own.lerp(other, weight)
-    return own.clamp_min(1e-30) ** (1 - weight) * other.clamp_min(1e-30) ** weight
+    return own.clamp_min(TINY_POWER) ** (1 - weight) * other.clamp_min(TINY_POWER) ** weight
 
 
 def real(values: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
 
 def _pruned(gram: np.ndarray) -> np.ndarray:
     """The best weights (K,) without those that matter little."""
-    large = best_weights(gram) >= LEAST_WEIGHT
+    large = best_weights(gram) >= UNUSED
     result = np.zeros(len(gram))
     result[large] = best_weights(gram[np.ix_(large, large)])
     return result

@@ -27,7 +27,7 @@ from torch import Tensor
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind, Measurements
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose
 from gsparc.physics.rays import closest_approach
 
@@ -96,7 +96,7 @@ class DirectedRays(Network):
         self.far = float(torch.quantile(reach[precomputed["votes"].T > 0], 0.99)) + AROUND
         around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
         self.place = PositionEncoding(EncodingSettings("fourier", settings.octaves), around)
-        self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.heading = PositionEncoding(EncodingSettings("fourier", 2), DIRECTIONS)
         inputs = self.place.width + self.heading.width
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
@@ -125,9 +125,8 @@ class DirectedRays(Network):
         fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
         depth = torch.cat([coarse, fine], -1).sort(-1).values
         points = places[:, None, None] + depth[..., None] * heading[:, :, None]
-        place = self.place(points.reshape(-1, 3)).view(*depth.shape, -1)
-        turn = self.heading(heading.reshape(-1, 3)).view(*heading.shape[:2], 1, -1)
-        out = self.network(torch.cat([place, turn.expand(-1, -1, self.samples, -1)], -1))
+        turn = self.heading(heading)[:, :, None].expand(-1, -1, self.samples, -1)
+        out = self.network(torch.cat([self.place(points), turn], -1))
         # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
         opacity = out[..., 2] - math.log(self.samples)
         clear = F.logsigmoid(-opacity)  # finite also where the sigmoid rounds to 1
@@ -138,12 +137,12 @@ class DirectedRays(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return channels (B, 1, 1) at searched directions."""
-        places = rx.position.reshape(-1, 3)
+        places = torch.atleast_2d(rx.position)
         return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Mean squared error along measured directions."""
-        places = batch.rx.position.reshape(-1, 3)
+        places = torch.atleast_2d(batch.rx.position)
         seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()
 
@@ -168,7 +167,7 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         known = np.ma.masked_invalid(np.concatenate(meetings, 1))
         distance = np.ma.median(known, axis=1).filled(np.nan)
         points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
-    flat = np.concatenate(points) if points else np.zeros((0, 3))
+    flat = np.concatenate([places[:0], *points])
     centres = _merged(flat[np.isfinite(flat[:, 0])])
     return centres, [_passed(place, own, centres) for place, own in zip(places, rays, strict=True)]
 
@@ -189,7 +188,7 @@ def _merged(points: np.ndarray) -> np.ndarray:
     Where none has as many, of the largest.
     """
     if not len(points):
-        return np.zeros((0, 3))
+        return points
     free = np.full(len(points), True)
     around = cKDTree(points).query_ball_point(points, MERGE)
     clusters = []

@@ -67,9 +67,11 @@ class Radiators(Network):
         spectrum = scene.site.kind == "spectrum"
         antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN
-        means = low + (high - low) * torch.rand(count, 3)
+        means = low + (high - low) * torch.rand(count, len(low))
         if scene.site.static_end == "tx" and scene.site.static_position is not None:
-            means[0] = torch.from_numpy(scene.site.static_position) + TRANSMITTER_SPREAD * torch.randn(3)
+            means[0] = torch.from_numpy(scene.site.static_position) + TRANSMITTER_SPREAD * torch.randn_like(
+                low
+            )
         self.means = nn.Parameter(means)
         self.log_extents = nn.Parameter(torch.full((count,), math.log(0.05)))
         self.gains = nn.Parameter(torch.randn(count, 2) * scene.reach / math.sqrt(2 * count))

@@ -23,8 +23,14 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.models.peers.gaussians import Deformation, DeformedPeer, GaussianNetwork, render_each
-from gsparc.models.peers.trained import Scene
+from gsparc.models.peers.gaussians import (
+    MOST_STRETCH,
+    Deformation,
+    DeformedPeer,
+    GaussianNetwork,
+    render_each,
+)
+from gsparc.models.peers.trained import DIRECTIONS, Scene
 from gsparc.ops import Cutoff, Pose, SphereGrid
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
@@ -54,8 +60,7 @@ class PlanarGaussians(GaussianNetwork):
         self.log_widths = nn.Parameter(torch.full((count, 2), math.log(spacing / 2)))
         self.angles = nn.Parameter(torch.zeros(count))
         self.strengths = nn.Parameter(torch.full((count,), 0.2))
-        sphere = torch.tensor([[-1.0] * 3, [1.0] * 3])
-        self.deformation = Deformation(sphere, scene.box, sum(CHANGES), settings)
+        self.deformation = Deformation(DIRECTIONS, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return spectra (B, H, W)."""
@@ -63,8 +68,7 @@ class PlanarGaussians(GaussianNetwork):
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        # A factor of 20 either way: exp of what a network says has no bound.
-        widths = (self.log_widths + stretch.clamp(-3, 3)).exp()
+        widths = (self.log_widths + stretch.clamp(-MOST_STRETCH, MOST_STRETCH)).exp()
         flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
         batch = len(moved)
@@ -73,8 +77,10 @@ class PlanarGaussians(GaussianNetwork):
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
         # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
-        here = Pose(torch.zeros(3), torch.eye(3))
-        image = render_each(geometry, strength, here, self.grid, cutoff=CUTOFF, compensate=False)
+        here = torch.zeros_like(self.base[0])
+        image = render_each(
+            geometry, strength, Pose.identity(here), self.grid, cutoff=CUTOFF, compensate=False
+        )
         return image.squeeze(1)
 
     def _changes(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:

@@ -18,7 +18,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.gradient_stage import interruptible, make_trainer, read_result, steps_asked_for
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
-from gsparc.field.module import NetworkModule
+from gsparc.field.module import LossSettings, NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
@@ -32,6 +32,8 @@ FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
 SLACK = 3.0  # times the seconds that are wanted, after which a schedule of a table's steps is cut
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
+DIRECTIONS = torch.tensor([[-1.0], [1.0]]).repeat(1, 3)  # box (2, 3) of unit vectors
+LEAST_POWER = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,8 @@ class Scene:
     @property
     def receiver(self) -> Pose | None:
         """Pose of the static receiver; None when it moves."""
-        if self.site.static_end == "tx" or self.site.static_position is None:
-            return None
-        turn = np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
-        return Pose(*(torch.from_numpy(one).float() for one in (self.site.static_position, turn)))
+        moves = self.site.static_end == "tx" or self.site.static_position is None
+        return None if moves else Query.at(self.site, self.box).rx
 
     @property
     def reach(self) -> float:
@@ -72,7 +72,7 @@ class Network(nn.Module):
         count: Gaussians, or virtual transmitters.
     """
 
-    ssim_weight = 0.2  # share of the loss of spectra
+    ssim_weight = LossSettings().ssim_weight
     snapshot: Snapshot = "none"
 
     def __init__(self, scene: Scene, count: int = 0) -> None:
@@ -96,6 +96,11 @@ def perceptron(
     sizes = [inner, *[width] * depth]
     layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), activation())]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
+
+
+def magnitude(power: Tensor) -> Tensor:
+    """Return roots, with a slope that is finite at zero."""
+    return (power + LEAST_POWER).sqrt()
 
 
 @dataclass(eq=False, kw_only=True)

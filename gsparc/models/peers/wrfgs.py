@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
+    MOST_STRETCH,
     Deformation,
     DeformedPeer,
     GaussianNetwork,
@@ -48,8 +49,9 @@ class DeformedGaussians(GaussianNetwork):
         """Return spectra (B, H, W)."""
         field = self.field
         place, turn, stretch, fade, light = self._changes(tx, rx)
+        stretch = stretch.clamp(-MOST_STRETCH, MOST_STRETCH)
         geometry = (
-            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch.clamp(-3, 3)).exp(),
+            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch).exp(),
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
         )  # fmt: skip
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)

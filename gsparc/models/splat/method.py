@@ -21,19 +21,12 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
-from gsparc.field import edit
+from gsparc.field import edit, gradient_stage
 from gsparc.field.confidence import ConfidenceSettings, fit_errors
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.gradient_stage import (
-    TrainerResult,
-    interruptible,
-    make_trainer,
-    read_result,
-    steps_asked_for,
-)
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
@@ -58,6 +51,7 @@ from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatabl
 
 log = logging.getLogger(__name__)
 
+THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
@@ -176,12 +170,12 @@ class LearnedField(Method):
             files = GsparcCheckpointIO(self, context.config_yaml, self._marks(stage, budget, origin))
             heeded.count("dataset.batch_size")
             began = budget.counted
-            trainer, batches = make_trainer(
+            trainer, batches = gradient_stage.make_trainer(
                 module, data, stage.fold, stage.context, files, budget, self._watch(stage)
             )
-            with interruptible(trainer, batches):
+            with gradient_stage.interruptible(trainer, batches):
                 trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
-            self._end(stage, read_result(trainer, budget), began, budget)
+            self._end(stage, gradient_stage.read_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
         what = f"final, {self.steps} of {self.steps_taken} steps kept"
         context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
@@ -219,7 +213,7 @@ class LearnedField(Method):
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
-        asked = steps_asked_for(context, len(watched.train), self.most_steps)
+        asked = gradient_stage.steps_asked_for(context, len(watched.train), self.most_steps)
         usual = budget.effort.steps_after_solving if solved else budget.effort.steps
         steps = usual if asked is None else asked
         log.info(
@@ -321,7 +315,9 @@ class LearnedField(Method):
             return [KeepBest(stage.patience)] if self.keep_best else []
         return [] if self._paying is None else [StopAt(self._paying)]
 
-    def _end(self, stage: Stage, result: TrainerResult, began: Spent, budget: TimeBudget) -> None:
+    def _end(
+        self, stage: Stage, result: gradient_stage.TrainerResult, began: Spent, budget: TimeBudget
+    ) -> None:
         """Note what the steps of a stage were worth."""
         seconds = (budget.counted - began).wall
         self._earlier_s += seconds
@@ -535,9 +531,9 @@ def _all_rows(fold: Fold) -> Fold:
 def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    if len(known) < 3 * LEAST_HELD:
+    if len(known) < THIRDS * LEAST_HELD:
         return fold
-    cut = cut_inside(data, fold, context.split, 3, context.seed).folds[0]
+    cut = cut_inside(data, fold, context.split, THIRDS, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 

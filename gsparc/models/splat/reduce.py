@@ -47,7 +47,8 @@ def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) ->
     if method.fitted().site.static_end != "rx":
         return {}
     rx = data.batch(rows[:1]).rx
-    return {"receiver": torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])}
+    pose = rx[0] if rx.batched else rx
+    return {"receiver": torch.cat([pose.position[None], pose.rotation])}
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
