@@ -24,9 +24,9 @@ from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
-from gsparc.models.pareto import front
 from gsparc.models.reduced import combinations, reduced
 from gsparc.prediction import operating_point
+from gsparc.prediction.pareto import front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, percentiles, reference_copy
 from gsparc.training import tracking

@@ -182,8 +182,7 @@ def make_trainer(
         ValueError: several devices that do not train one model.
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
-    budget.pause()
-    budget.go()  # what other processes go on from
+    budget.restart()
     if batches is None or batches.measurements is not data:
         batches = Loaded(data, context.batch_size)
     batches.use(fold, context.seed)

@@ -11,8 +11,8 @@ import numpy as np
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Measurements
-from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.method import Method, import_path
+from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
 from gsparc.models.refined_places import errors_of
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import pickle
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,6 +25,9 @@ from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
     from gsparc.processes.powers import PowerProcess
+
+T = TypeVar("T")
+DOUBLE = {torch.float32: torch.float64, torch.complex64: torch.complex128}
 
 
 @dataclass(frozen=True)
@@ -244,6 +249,34 @@ def predictions(
         factor = factors[chosen]
         variance = None if said.variance is None else said.variance * factor[:, 0].abs().square().mean(1)
         yield chosen, batch, replace(said, mean=said.mean * factor, variance=variance)
+
+
+def in_double(part: T) -> T:
+    """Return a copy of anything that pickles, its tensors constants in float64 or complex128.
+
+    What is of these types already, and arrays of NumPy, are shared and not copied.
+    """
+    tensors: dict[int, Any] = {}  # alive as long as their numbers are asked for
+
+    class Parts(pickle.Pickler):
+        def persistent_id(self, value: Any) -> int | None:
+            if not isinstance(value, Tensor | np.ndarray):
+                return None
+            tensors[id(value)] = value
+            return id(value)
+
+    class Doubled(pickle.Unpickler):
+        def persistent_load(self, number: int) -> Any:
+            value = tensors[number]
+            if isinstance(value, Tensor):
+                tensors[number] = value = value.detach().to(DOUBLE.get(value.dtype, value.dtype))
+            return value
+
+    whole = io.BytesIO()
+    Parts(whole, pickle.HIGHEST_PROTOCOL).dump(part)
+    whole.seek(0)
+    result: T = Doubled(whole).load()
+    return result
 
 
 @contextmanager

@@ -14,11 +14,11 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Settings
 from gsparc.ops import SphereGrid
 
 log = logging.getLogger(__name__)
 
+Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
 AS_TRAINED = {"keep": 1.0, "stride": 1, "confidence": True}  # else: None
 Measured = dict[str, Tensor]
 

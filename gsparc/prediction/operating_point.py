@@ -15,9 +15,9 @@ import torch
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
-from gsparc.models.pareto import Point, Settings
 from gsparc.models.reduced import Measured, reduced
 from gsparc.prediction.confidence import trusted_of
+from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, interleaved
 from gsparc.processes.stored import Stored, restored, stored

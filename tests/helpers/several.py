@@ -106,7 +106,6 @@ def trained(
         callbacks=lambda: [*densifying(), last, *more],
     )  # fmt: skip
     budget = TimeBudget()
-    budget.pause()
     L.seed_everything(0, verbose=False)
     trained = made.double() if double else made
     trainer, batches = make_trainer(trained, data, fold, context, TorchCheckpointIO(), budget)

@@ -23,9 +23,9 @@ from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better,
 from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Point, Settings, worded
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
+from gsparc.prediction.pareto import Point, Settings, worded
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import Call, ClockSettings, interleaved
 

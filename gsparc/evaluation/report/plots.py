@@ -20,7 +20,7 @@ from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_be
 from gsparc.evaluation.report.runs import Run, sizes
 from gsparc.evaluation.report.table import interval
 from gsparc.evaluation.report.tables import grouped
-from gsparc.models.pareto import front
+from gsparc.prediction.pareto import front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95

@@ -27,7 +27,7 @@ from gsparc.field.response import ArrayResponse
 from gsparc.models.array_vectors.cross_validation import tune
 from gsparc.models.array_vectors.vector_cache import recovered, report
 from gsparc.models.array_vectors.vector_gp import aligned_by, aligned_to, mirror_elements
-from gsparc.models.left_out_images import LeftOut
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering

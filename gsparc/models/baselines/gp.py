@@ -18,9 +18,8 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
-from gsparc.models.reduced import Filled, MeanOnly
+from gsparc.models.reduced import Filled, MeanOnly, Settings
 from gsparc.models.target_rows import entry_variance, rows_of, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart

@@ -22,7 +22,7 @@ from gsparc.models.directional.visibility import VisibilityGP
 from gsparc.models.image_sources.gp_likelihood import with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import steering
-from gsparc.models.in_double import in_double
+from gsparc.models.method import in_double
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import apart, matern32_of_squares

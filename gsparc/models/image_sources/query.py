@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import directions
-from gsparc.models.in_double import in_double
+from gsparc.models.method import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import apart

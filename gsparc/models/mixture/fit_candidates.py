@@ -18,11 +18,11 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
-from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
 from gsparc.training.context import FitContext, FitReport

@@ -25,11 +25,11 @@ from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import factors_of_runs
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
-from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.image_sources.frame import each_once
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
+from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.weights import comparable, explained
 from gsparc.models.refined_places import displaced, errors_of, refined
 from gsparc.models.run_factors import RunFactors

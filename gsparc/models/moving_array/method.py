@@ -18,8 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.in_double import in_double
-from gsparc.models.method import Prediction
+from gsparc.models.method import Prediction, in_double
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import Array, Images, reduced

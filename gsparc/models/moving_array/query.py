@@ -14,13 +14,11 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.models.in_double import in_double
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, in_double
 from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, mixture
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Filled, View
+from gsparc.models.reduced import Filled, Settings, View
 from gsparc.ops.transforms import followed
 from gsparc.physics.lags import Lags
 from gsparc.physics.separable import Separable

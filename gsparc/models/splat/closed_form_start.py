@@ -23,7 +23,7 @@ from gsparc.field.initial import InitTask, Start, unchanged
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import through_array
 from gsparc.models.baselines.gp import choose_kernel, principal_components
-from gsparc.models.left_out_images import LeftOut, predict_left_out
+from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor

@@ -21,8 +21,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.weights import mixed
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import averaged, mean_alone
+from gsparc.models.reduced import Settings, averaged, mean_alone
 from gsparc.models.splat.auto_settings import resolve
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import no_array

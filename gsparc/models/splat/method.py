@@ -36,14 +36,13 @@ from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import Stored
 from gsparc.models.fitting import Origin
-from gsparc.models.in_double import in_double
-from gsparc.models.left_out_images import LeftOut
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, in_double
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, resolve, settled
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.models.splat.closed_form_start import prepare
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport

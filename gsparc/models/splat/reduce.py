@@ -17,8 +17,7 @@ from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.method import Method
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Filled, coarser
+from gsparc.models.reduced import Filled, Settings, coarser
 from gsparc.ops import Pose, SphereGrid
 from gsparc.processes.features import correlation, pivoted_rows, with_places
 

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 from gsparc.models.baselines.gp import choose_kernel
-from gsparc.models.left_out_images import LeftOut
+from gsparc.models.splat.left_out_images import LeftOut
 
 COUNT, PIXELS = 30, 12
 
