@@ -109,7 +109,8 @@ def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
             others = own[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
             # Positive root of own x^2 - pull x - power size = 0, the likelihood's slope by a factor's size.
-            length = (pull + np.sqrt(pull**2 + 4 * own[r] * power * size[r])) / max(2 * own[r], 1e-300)
+            twice = max(2 * own[r], np.finfo(float).tiny)
+            length = (pull + np.sqrt(pull**2 + 2 * twice * power * size[r])) / twice
             factors[r] = length * (others / pull if pull > 0 else 1.0)
         if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():
             break

@@ -142,22 +142,9 @@ class Mixture(LearnsTogether, ClosedForm):
         self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
         context: FitContext,
     ) -> FitReport:  # fmt: skip
-        """Fit and weigh candidates, of channels of several runs in the phase and level of one."""
-        budget, known = context.time_budget(), np.sort(np.concatenate([fold.train, fold.val]))
-        self.runs = _runs(data, known, context)
-        aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
-        within = replace(context, budget_s=budget.left_s)
-        report = self._fit_members(parts, init, self.runs.aligned(data), fold, within)
-        if not aligning:
-            return report
-        cost = Cost({"factors of runs": aligning}) + report.cost
-        return replace(report, seconds=report.seconds + aligning, cost=cost)
-
-    def _fit_members(
-        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
-        context: FitContext,
-    ) -> FitReport:  # fmt: skip
         """Fit candidates, weigh several by rows held out, and condition them on all rows.
+
+        Channels of several runs are learned in the phase and level of one.
 
         Raises:
             ValueError: the only candidate, or the one asked for, cannot solve this.
@@ -166,6 +153,9 @@ class Mixture(LearnsTogether, ClosedForm):
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
+        self.runs = _runs(data, known, context)
+        data = self.runs.aligned(data)
+        stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
         cut = cut_inside(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_all(
             parts, init, self.switches, data, fold, context, budget, cut
@@ -185,7 +175,7 @@ class Mixture(LearnsTogether, ClosedForm):
         seconds = budget.counted.wall
         if several:
             context.curve(seconds, "final")
-        stages = {name: report.seconds for name, report in reports.items()}
+        stages |= {name: report.seconds for name, report in reports.items()}
         # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages["final weights"] = seconds - self.init_s

@@ -16,6 +16,7 @@ from gsparc.field.model import FULL_SPHERE_ROWS, RasterSettings
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 
+SHIFT = 0.1  # [m], of directions [rad], that a place moves by per unit of the network's output
 MOST_STRETCH = 3.0  # of a log scale, a factor of 20 either way: exp of what a network says has no bound
 GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
     "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,

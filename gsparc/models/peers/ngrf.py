@@ -39,9 +39,7 @@ class NGRF(TrainedPeer):
     """
 
     step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0038, "spectrum": 0.020}
-    rates: ClassVar[dict[str, float]] = {
-        "means": 3e-3, "log_extents": 5e-3, "gains": 1e-2, "antennas": 5e-3,
-    }  # fmt: skip
+    rates: ClassVar[dict[str, float]] = {"means": 3e-3, "gains": 1e-2}
     name: str = "ngrf"
     count: int = 30
     rate: float = 5e-3

@@ -25,6 +25,7 @@ from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.models.peers.gaussians import (
     MOST_STRETCH,
+    SHIFT,
     Deformation,
     DeformedPeer,
     GaussianNetwork,
@@ -37,7 +38,6 @@ CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
 THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other lose a twentieth on average
 CUTOFF = Cutoff(3e-3, relative=True)
 FLAT = 1e-4  # [m] of the third axis, at a metre
-SHIFT = 0.1  # [rad] per unit of the network's output
 
 
 class PlanarGaussians(GaussianNetwork):
@@ -117,9 +117,7 @@ class SwiftWRF(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
     step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.031}
-    rates: ClassVar[dict[str, float]] = {
-        "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
-    }  # fmt: skip
+    rates: ClassVar[dict[str, float]] = {"centres": 2e-3, "strengths": 1e-2}
     makes = PlanarGaussians
     name: str = "swiftwrf"
     count: int = 300

@@ -20,6 +20,7 @@ from gsparc.data.schema import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     MOST_STRETCH,
+    SHIFT,
     Deformation,
     DeformedPeer,
     GaussianNetwork,
@@ -31,7 +32,6 @@ from gsparc.models.peers.trained import Scene
 from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
-SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
 
 
 class DeformedGaussians(GaussianNetwork):

@@ -23,6 +23,7 @@ from gsparc.field.initial import InitTask, Start, unchanged
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import through_array
 from gsparc.models.baselines.gp import choose_kernel, principal_components
+from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
@@ -35,7 +36,6 @@ IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap,
 CHUNK = 256  # images held as floats at a time
 KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
 COMPONENTS = 128
-LEAST_ROWS = 4  # for predictions without their neighbours to say anything
 GAPS = (0.0, 2.0, 5.0, 10.0)  # between a row and what is left, in spacings of rows
 PIXELS, CENTRES = 600, 160  # of the images, and rows, that are predicted so
 LEAST_NOISE = 1e-6  # of the kernel's variance
@@ -177,7 +177,7 @@ def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[fl
 def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
     """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
     count = len(places)
-    if count < LEAST_ROWS:
+    if count < LEAST_HELD:
         return None
     draws = np.random.default_rng(0)
     pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))

@@ -96,13 +96,9 @@ class ImageProcess(LearnedField):
         return report.costing(Cost(spent, unused))
 
     @property
-    def _alone(self) -> bool:
+    def _alone(self) -> bool:  # type: ignore[override]
         """Whether the averaged process has all the weight."""
         return self._average is not None and self._average[1] >= 1
-
-    def _pays(self) -> bool:
-        """Whether the rendered field is worth another stage."""
-        return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         if self.plain:

@@ -102,6 +102,7 @@ class LearnedField(Method):
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
+    _alone = False  # whether a process beside it has all the weight: another stage is worth no seconds
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -239,15 +240,11 @@ class LearnedField(Method):
                 yield Stage("train", watched, context, 0)
             self._calibrate(data, watched)
             self._weigh_process(data, watched)
-        if self.refit and len(watched.val) and self._pays() and not budget.over():
+        if self.refit and len(watched.val) and not self._alone and not budget.over():
             kept, resume = (self.model, self.steps, self._prior), context.resume if refits else None
             yield Stage("refit", _all_rows(watched), context.within("refit", resume=resume), steps)
             if budget.limited and not refits:  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
-
-    def _pays(self) -> bool:
-        """Whether another stage is worth its seconds."""
-        return True
 
     def _start(self, stage: Stage, data: Measurements, budget: TimeBudget) -> GaussianModule | None:
         """Make a fresh model, or read one back; return what trains it, None where no step is taken.
