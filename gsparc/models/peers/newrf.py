@@ -39,54 +39,11 @@ LEAST = 5  # meeting points of a virtual transmitter: fewer meet by chance
 NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
 
 
-@dataclass(eq=False, kw_only=True)
-class NeWRF(TrainedPeer):
-    """Channels of one antenna and one tone, with directions of arrival.
-
-    Args:
-        width, depth, octaves: of the network.
-        samples: points per ray, half of them fine.
-        neighbours: training receivers that vote at a query.
-        others: see `TrainedPeer`.
-    """
-
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
-    name: str = "newrf"
-    width: int = 128
-    depth: int = 4
-    octaves: int = 8
-    samples: int = 64
-    neighbours: int = 6
-
-    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return virtual transmitters, and which of them every training receiver sees.
-
-        Raises:
-            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
-        """
-        if data.directions is None:
-            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
-        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
-            raise ValueError(
-                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
-            )
-        places = data.rx_position[rows]
-        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
-        centres, seen = virtual_transmitters(places, rays)
-        if not len(centres):
-            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
-        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
-        return {**found, "votes": votes(seen, len(centres))}
-
-    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return DirectedRays(scene, precomputed, self)
-
-
 class DirectedRays(Network):
     """The network and the march."""
 
-    def __init__(self, scene: Scene, precomputed: dict[str, Tensor], settings: NeWRF) -> None:
+    def __init__(self, scene: Scene, settings: NeWRF) -> None:
+        precomputed = settings.precomputed
         super().__init__(scene, len(precomputed["virtual"]))
         assert scene.site.wavelength is not None
         self.precomputed = precomputed
@@ -145,6 +102,47 @@ class DirectedRays(Network):
         places = torch.atleast_2d(batch.rx.position)
         seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()
+
+
+@dataclass(eq=False, kw_only=True)
+class NeWRF(TrainedPeer):
+    """Channels of one antenna and one tone, with directions of arrival.
+
+    Args:
+        width, depth, octaves: of the network.
+        samples: points per ray, half of them fine.
+        neighbours: training receivers that vote at a query.
+        others: see `TrainedPeer`.
+    """
+
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
+    makes = DirectedRays
+    name: str = "newrf"
+    width: int = 128
+    depth: int = 4
+    octaves: int = 8
+    samples: int = 64
+    neighbours: int = 6
+
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Return virtual transmitters, and which of them every training receiver sees.
+
+        Raises:
+            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
+        """
+        if data.directions is None:
+            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
+        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
+            raise ValueError(
+                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
+            )
+        places = data.rx_position[rows]
+        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
+        centres, seen = virtual_transmitters(places, rays)
+        if not len(centres):
+            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
+        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
+        return {**found, "votes": votes(seen, len(centres))}
 
 
 def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -121,7 +122,7 @@ class TrainedPeer(Method):
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
     step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare)
-    makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
+    makes: ClassVar[Callable[[Scene, Any], Network]]  # untrained, of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
     budget_s: float | None = None
@@ -139,11 +140,6 @@ class TrainedPeer(Method):
             raise ValueError(
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
-
-    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """Return the untrained network of a scene; `precomputed` is what was computed before training."""
-        network: Network = self.makes(scene, self)
-        return network
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return tensors computed from the training rows (n,) before training; stored with the weights."""
@@ -169,7 +165,7 @@ class TrainedPeer(Method):
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
-        self.network = self.build(_scene(data, rows), self.precomputed)
+        self.network = self.makes(_scene(data, rows), self)
         if context.resume is not None:
             origin.refuse_other(interrupted(context.resume))
         own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
@@ -227,7 +223,7 @@ class TrainedPeer(Method):
         """See `Method.restore`."""
         self.site, scene = site, Scene(site, tuple(state["shape"]), state["box"])
         self.precomputed, self.steps = dict(state["found"]), int(state["steps"])
-        self.network = self.build(scene, self.precomputed)
+        self.network = self.makes(scene, self)
         self.network.load_state_dict(state["network"])
         self.network.eval()
 
