@@ -11,8 +11,8 @@ from posts import POSTS, distances, heard
 from scenes import fold_of
 
 from gsparc.data.splits import SplitSettings
-from gsparc.models import each_or_together
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.mixture import each_or_together
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
