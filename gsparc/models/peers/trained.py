@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -122,7 +121,7 @@ class TrainedPeer(Method):
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
     step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare)
-    makes: ClassVar[Callable[[Scene, Any], Network]]  # untrained, of a scene and these settings
+    makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
     budget_s: float | None = None
