@@ -24,7 +24,7 @@ from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import table, write_samples
-from gsparc.models.reduced import combinations, reduced
+from gsparc.models.reduced import reduce_method, setting_combinations
 from gsparc.prediction import operating_point
 from gsparc.prediction.pareto import front
 from gsparc.prediction.predictor import Predictor
@@ -51,12 +51,12 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     rows = rows_of(fold, config.eval_on)
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    measured = method.contributions(data, learned)
-    settings = list(combinations(method, plain(config.grid)))
+    measured = method.reduction_inputs(data, learned)
+    settings = list(setting_combinations(method, plain(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
-    candidates = [(some, reduced(method, some, measured)) for some in settings]
+    candidates = [(some, reduce_method(method, some, measured)) for some in settings]
     others = tradeoff.others_of(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
@@ -89,7 +89,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     heads, lines = tradeoff.cells_of(best, figure)
-    with tracking.opened(config) as loggers:
+    with tracking.open_loggers(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.log_table(loggers, "operating points", heads, lines)
     sheet = table(title, ["not beaten"], heads[1:], lines)

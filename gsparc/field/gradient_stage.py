@@ -25,7 +25,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.distributed import SummedGradients
 from gsparc.field.module import NetworkModule
-from gsparc.field.stage_budget import SPENT, Budget
+from gsparc.field.stage_budget import SPENT, StageBudget
 from gsparc.training.context import FitContext
 from gsparc.training.time_budget import Spent, TimeBudget
 
@@ -63,7 +63,7 @@ class TrainerResult:
     timed_out: bool
 
 
-def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> int | None:
+def requested_steps(context: FitContext, rows: int, own: int | None = None) -> int | None:
     """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
 
     Args:
@@ -88,7 +88,7 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
     return min(one for one in (steps, of_epochs) if one is not None)
 
 
-class ReturnMetrics(L.Callback):
+class ReportSteps(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
@@ -98,7 +98,7 @@ class ReturnMetrics(L.Callback):
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
 
 
-def stands(trainer: L.Trainer) -> bool:
+def step_is_complete(trainer: L.Trainer) -> bool:
     """Whether a step is done with, at the end of its batch or of its look at validation rows.
 
     Lightning leaves out a look that follows, where a run goes on from a state before it.
@@ -134,7 +134,7 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
-        if self.requested and stands(trainer):
+        if self.requested and step_is_complete(trainer):
             trainer.save_checkpoint(self.file)
             raise _Stopped
 
@@ -188,7 +188,11 @@ def make_trainer(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), module.count is not None)]
+    callbacks = [
+        StageBudget(budget),
+        *watch,
+        *_told(context.callbacks(), len(fold.val), module.count is not None),
+    ]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -218,7 +222,7 @@ def make_trainer(
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
-        callbacks=[*callbacks, ReturnMetrics(), stop],
+        callbacks=[*callbacks, ReportSteps(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
@@ -253,7 +257,7 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
         batches.trainer = None  # which holds the optimizer's state
 
 
-def read_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult:
+def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult:
     """Return the steps of a Trainer that has ended, and charge what it spent elsewhere to the budget."""
     metrics = trainer.callback_metrics
     more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run

@@ -61,7 +61,7 @@ class Alignment:
     phase_reference: Literal["carrier", "neighbours"]
 
 
-def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
+def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     """Return measurements with training and validation rows turned to each other, and rows to learn from.
 
     Several packets of one place and station become one, the first of them, whose channel is their mean. Rows
@@ -77,7 +77,7 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
     for rows in _parts(data, known):
-        best, own = align(rows, site.freedom, site), target[rows.rows]
+        best, own = align_rows(rows, site.freedom, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
@@ -99,14 +99,14 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
     turned = replace(
         data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
     )
-    train, turned = averaged(turned, fold.train)
-    val, turned = averaged(turned, fold.val)
+    train, turned = average_packets(turned, fold.train)
+    val, turned = average_packets(turned, fold.val)
     result = turned, Fold(train, val, fold.test)
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
 
 
-def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
+def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
     """Return the first of `rows` at each place and station, and measurements where these are the means."""
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
     packets, seen = np.c_[data.moving[rows], station], None if data.mask is None else data.mask[rows]
@@ -143,7 +143,7 @@ def _rms(values: np.ndarray) -> np.ndarray:
 _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measurements, Fold]]] = []
 
 
-def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
+def align_rows(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     if len(rows.values) == 1:  # a row alone has no other to be turned to
         return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")

@@ -80,13 +80,13 @@ class ClosedForm(Method):
         yield 1.0, self
 
 
-def stored(method: Method) -> dict[str, Any]:
-    """Return what `restored` reads."""
-    return {"target": import_path(method.stored_as), "state": method.state()}
+def method_state(method: Method) -> dict[str, Any]:
+    """Return what `method_from_state` reads."""
+    return {"target": import_path(method.stored_class), "state": method.state()}
 
 
-def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
-    """Return the method whose `stored` state this was.
+def method_from_state(site: Site, state: dict[str, Any]) -> ClosedForm:
+    """Return the method whose `method_state` state this was.
 
     Raises:
         ValueError: it names what is no such method of gsparc or a plugin.

@@ -28,11 +28,11 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
-from gsparc.models.closed_form import stored
+from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.reduced import View
-from gsparc.models.target_rows import heard
+from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import Spent, less_repeatable
@@ -43,7 +43,7 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that statio
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
-def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
+def by_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
     """Return what makes a method of all stations where there are several, else `factory` itself.
 
     Raises:
@@ -61,12 +61,12 @@ def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> t
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
-    rows = fold.train if method.uses_censored else heard(data, fold.train)
+    rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
     known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
     return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
 
 
-def of_station(site: Site, number: int) -> Site:
+def station_site(site: Site, number: int) -> Site:
     """Return the site as one station sees it; of `UNHEARD`, with both ends moving.
 
     Its hash is its own, so that nothing kept of one station is taken for another's.
@@ -101,7 +101,7 @@ class PerStation(Method):
         self._shared = False  # whether one copy knows all stations
 
     @property
-    def stored_as(self) -> type[MethodFactory]:
+    def stored_class(self) -> type[MethodFactory]:
         """What makes the copies, of which each names its own class."""
         return type(self.factory)
 
@@ -129,7 +129,7 @@ class PerStation(Method):
         budget = context.time_budget()
         numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
-        left = None if context.resume is None else fitting.folder_of(context.resume, fitting.STATIONS)
+        left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
@@ -152,7 +152,7 @@ class PerStation(Method):
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before = budget.counted.wall
             try:
-                copy, report = fitting.fit(self.factory, part, inner, own)
+                copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
                 # A single station's own message already names the file to go on from.
                 if not resumable or len(numbers) == 1:
@@ -160,7 +160,7 @@ class PerStation(Method):
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = fitting.marks(report, part, inner, own)
+                extra = fitting.checkpoint_marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
@@ -189,7 +189,7 @@ class PerStation(Method):
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
             with heeded.apart():
-                how, why = self.factory.best_stations(data, fold, context)
+                how, why = self.factory.choose_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.factory.shares(data.site)
         self._shared = together and joint
@@ -267,16 +267,16 @@ class PerStation(Method):
             assert self.site is not None and self.site.stations is not None
             name = self.site.stations.name[number]
             raise ValueError(f"{self.name}: station {name} had too few training rows")
-        return OfStation(copy, number) if self._shared else copy
+        return OneStationView(copy, number) if self._shared else copy
 
-    def every(self) -> OfStations | None:
+    def every(self) -> AllStationsView | None:
         """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
-        return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
+        return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
-        return site if number == UNHEARD and self.factory.shares(site) else of_station(site, number)
+        return site if number == UNHEARD and self.factory.shares(site) else station_site(site, number)
 
     def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
@@ -299,14 +299,14 @@ class PerStation(Method):
 
     def state(self) -> dict[str, Any]:
         """Return the class and state of every copy, by its station's number."""
-        copies = {str(number): stored(copy) for number, copy in self._copies.items()}
+        copies = {str(number): method_state(copy) for number, copy in self._copies.items()}
         return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = self.factory.made_as(part["target"])
+            self._copies[int(number)] = copy = self.factory.create_as(part["target"])
             copy.name = self.name
             copy.restore(self._site_of(site, int(number)), part["state"])
 
@@ -331,7 +331,7 @@ class PerStation(Method):
         return iter(self._copies.items())
 
 
-class OfStation(View):
+class OneStationView(View):
     """A method that knows all stations, asked about one: several may stand at one place."""
 
     def __init__(self, inner: Method, number: int) -> None:
@@ -352,7 +352,7 @@ class OfStation(View):
         return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
 
 
-class OfStations(OfStation):
+class AllStationsView(OneStationView):
     """A method that knows all stations of powers, asked about each of them at every place."""
 
     def __init__(self, inner: Method, count: int) -> None:

@@ -20,7 +20,7 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.weights import comparable, real
+from gsparc.models.mixture.weights import in_error_unit, to_real_entries
 from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER
 from gsparc.ops import Pose
 
@@ -95,7 +95,9 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
     return unit * std[:, None], min(exact for _, exact, _ in tried) - least
 
 
-def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
+def refine_places(
+    field: ClosedForm, data: Measurements, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
     """Return rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
@@ -134,7 +136,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def mean(places: Tensor) -> Tensor:
-        return real(comparable(field.predict(at(places)).mean, site))
+        return to_real_entries(in_error_unit(field.predict(at(places)).mean, site))
 
     with torch.no_grad():
         result = field.predict(at(moving))  # what is computed once and kept must not be so inside `jvp`
@@ -143,7 +145,9 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
     if site.kind == "rssi":
         # From linear powers to decibels, to first order.
         variance = variance * (DECIBELS_PER_NAT / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
-    residual = real(comparable(batch.target, site)) - real(comparable(left.mean, site))
+    residual = to_real_entries(in_error_unit(batch.target, site)) - to_real_entries(
+        in_error_unit(left.mean, site)
+    )
     parts = 2 if batch.target.is_complex() else 1
     # Half of a circular variance is in either part.
     spread = (variance / parts)[:, None].expand_as(residual)
@@ -154,7 +158,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
     return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
 
 
-def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
+def move_rows(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
     """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
     name = "tx" if data.site.moving_end == "tx" else "rx_position"
     moved = getattr(data, name).copy()

@@ -73,7 +73,7 @@ class RunFactors(Stored):
         return replace(data, target=target, noise_variance=noise, run=None)
 
 
-def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+def fit_run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return what rows are multiplied by to belong to the largest run, (runs,) complex128, by likelihood.
 
     Args:
@@ -82,16 +82,16 @@ def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.
         run: (n,) int, numbers 0 to runs - 1, each of which occurs.
     """
     count = np.bincount(run)
-    return aligning(run_quadratic(inverse, target, run), target.shape[1] * count)
+    return best_run_factors(run_quadratic(inverse, target, run), target.shape[1] * count)
 
 
 def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Return M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
+    """Return M (runs, runs) complex128 of the module's text, of arguments as in `fit_run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member
 
 
-def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
+def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return factors (runs,) from M (runs, runs), of one process or summed over many, and runs' sizes.
 
     Args:

@@ -73,19 +73,19 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     return variance
 
 
-def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
+def heard_rows(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
     return rows[data.side(rows) <= 0]
 
 
-def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+def unheard_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """Say what a fit to `heard(data, rows)` left out; nothing where all of rows (n,) were heard."""
     side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
 
-def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
+def power_rows(data: Measurements, rows: np.ndarray) -> Rows:
     """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
     return Rows(data.moving[rows], decibels, data.side(rows))

@@ -15,7 +15,7 @@ import torch
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
-from gsparc.models.reduced import Measured, reduced
+from gsparc.models.reduced import Measured, reduce_method
 from gsparc.prediction.confidence import trusted_of
 from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
@@ -52,7 +52,7 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.amend(path, {KEY: {"points": stored(found), "measured": measured}})
+    checkpoint.update_extra(path, {KEY: {"points": stored(found), "measured": measured}})
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
@@ -85,7 +85,7 @@ def within(method: Method, stored: checkpoint.Stored, budget_ms: float) -> tuple
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
     # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
-    ways = [reduced(method, point.settings, measured) for point in points]
+    ways = [reduce_method(method, point.settings, measured) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
     ends = 2 if site.static_end is None else 1
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)

@@ -56,13 +56,13 @@ def compose(*overrides: str, config: str = "train"):
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
 
-    from gsparc.models.registry import complete
+    from gsparc.models.registry import fill_defaults
 
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         composed = hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
     if "model" in composed:
-        complete(composed.model)
+        fill_defaults(composed.model)
     return composed
 
 

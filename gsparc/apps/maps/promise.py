@@ -16,7 +16,7 @@ from gsparc.data.executor import each
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models.method import Method, predictions
+from gsparc.models.method import Method, predict_in_batches
 from gsparc.prediction.predictor import keep
 from gsparc.prediction.refit import Learned
 
@@ -142,7 +142,7 @@ def evidence_of(method: Method, data: Measurements, fold: Fold, block: np.ndarra
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
     mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    for chosen, _, said in predictions(method, data, rows, CHUNK):
+    for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted(said, data.site.kind, data.site.target_scale)
     return mean, spread
 

@@ -26,7 +26,7 @@ from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import git, read_summary
-from gsparc.models.fitting import LAST, leaves
+from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class State:
         """Return the state of a resolved configuration on data (`content`) under a split (its hash)."""
         kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
-        named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
+        named = {name: value for name, value in dotted_settings(whole) if not (data and name in OF_DATA)}
         files = {name: value for name, value in named.items() if isinstance(value, str)}
         found = {name: _content_of(value) for name, value in files.items() if os.path.isfile(value)}
         if os.path.isdir(root := files.get("dataset.root", "")):

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY, TRAIN_S, markdown_table, shown
@@ -40,7 +40,7 @@ ROW = [
 ]  # fmt: skip
 
 
-def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
+def cells_of(filled: Sequence[CellResult]) -> pd.DataFrame:
     """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `rows_of`."""
     rows = []
     for one in filled:
@@ -59,7 +59,7 @@ def cells_of(filled: Sequence[Filled]) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def rows_of(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def rows_of(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:

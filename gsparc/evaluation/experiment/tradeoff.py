@@ -228,7 +228,7 @@ def cells_of(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]
 
 def irreducible(method: Method) -> list[str]:
     """Return a sentence where there is nothing to weigh against time."""
-    if method.knobs():
+    if method.reduction_settings():
         return []
     why = "it has no Gaussians, sources, components or variances to spare"
     if isinstance(method, PerStation):

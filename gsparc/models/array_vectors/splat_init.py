@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_errors
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Prior
-from gsparc.field.frozen import seen_by_array
+from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
@@ -130,7 +130,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
-        fit_errors(tuned.unknown, tuned.error),
+        fit_error_law(tuned.unknown, tuned.error),
         tuned.left_out,
         elapsed,
         training,
@@ -142,7 +142,7 @@ def start(model: GaussianModel, process: Learned, receiver: Pose) -> None:
     """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
     response = model.response
     assert isinstance(response, ArrayResponse)
-    view = seen_by_array(model, receiver)  # (N, M)
+    view = gaussian_vectors(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
     # Tikhonov's inverse: what the array hardly sees gets no large emissions.
     damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)

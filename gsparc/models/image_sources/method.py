@@ -274,8 +274,8 @@ class ImageSourceGP(SourcesInFrame):
         predicted = (self.weights[:, None, None] * each).sum(0)
         return frame.left_out(self.members[0].rows, predicted)
 
-    def knobs(self) -> tuple[str, ...]:
-        """See `Method.knobs`."""
+    def reduction_settings(self) -> tuple[str, ...]:
+        """See `Method.reduction_settings`."""
         return ("searches", "confidence")
 
     @torch.no_grad()

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import Posterior, shares
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import directions
-from gsparc.models.method import in_double
+from gsparc.models.method import to_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import apart
@@ -91,7 +91,7 @@ class Means:
     @cached_property
     def exact(self) -> Means:
         """The same in float64."""
-        return in_double(self)
+        return to_double(self)
 
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,).

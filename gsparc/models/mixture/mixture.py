@@ -24,14 +24,14 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import factors_of_runs
-from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
+from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import each_once
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
-from gsparc.models.mixture.weights import comparable, explained
-from gsparc.models.refined_places import displaced, errors_of, refined
+from gsparc.models.mixture.weights import explained_variance, in_error_unit
+from gsparc.models.refined_places import errors_of, move_rows, refine_places
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
@@ -123,7 +123,7 @@ class Mixture(LearnsTogether, ClosedForm):
         # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refined(self, self.runs.aligned(data), std)
+        rows, by, note = refine_places(self, self.runs.aligned(data), std)
         if by.any() and budget.over():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -132,7 +132,7 @@ class Mixture(LearnsTogether, ClosedForm):
             return replace(report, notes=(note, *report.notes), limited_by=limited)
         limited, spent = report.limited_by, budget.counted.wall
         rest = replace(context, budget_s=budget.left_s)
-        report = self._solve(parts, init, displaced(data, rows, by), fold, rest)
+        report = self._solve(parts, init, move_rows(data, rows, by), fold, rest)
         limited = less_repeatable(limited, report.limited_by)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
         notes = (note, *report.notes)
@@ -157,7 +157,7 @@ class Mixture(LearnsTogether, ClosedForm):
         data = self.runs.aligned(data)
         stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
         cut = cut_inside(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
-        found, reports, read = fit_candidates.fit_all(
+        found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, budget, cut
         )
         chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
@@ -182,7 +182,7 @@ class Mixture(LearnsTogether, ClosedForm):
         unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
         notes = [note for name in chosen for note in reports[name].notes]
         limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited).costing(Cost(stages, unused))
+        return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
 
     def _explained(self, data: Measurements, fold: Fold, apart: bool) -> float | None:
         """What Gaussians explain of validation rows; conditions on training rows, unless `apart` already."""
@@ -193,8 +193,8 @@ class Mixture(LearnsTogether, ClosedForm):
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
         assert result is not None
-        own, target = (comparable(one, data.site) for one in (result, batch.target))
-        return explained(own, target, data.site.kind != "csi")
+        own, target = (in_error_unit(one, data.site) for one in (result, batch.target))
+        return explained_variance(own, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Condition every member on the same rows."""
@@ -316,14 +316,14 @@ class Mixture(LearnsTogether, ClosedForm):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "members": [stored(member) for member in self.members], "weights": list(self.weights),
+            "members": [method_state(member) for member in self.members], "weights": list(self.weights),
             "started": self.started, "explained": self.explained, "runs": self.runs.state(),
         }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.started, self.explained = site, str(state["started"]), state["explained"]
-        self.members = [restored(site, member) for member in state["members"]]
+        self.members = [method_from_state(site, member) for member in state["members"]]
         self.weights, self.runs = tuple(state["weights"]), RunFactors.read(state["runs"])
 
 

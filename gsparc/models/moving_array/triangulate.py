@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
-from gsparc.models.terms import no_array
+from gsparc.models.terms import array_obstacle
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 
@@ -196,7 +196,7 @@ def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
 def site_problem(data: Measurements) -> str | None:
     """Return why sources cannot be triangulated from these measurements; None when they can."""
     otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
-    problem = no_array(data.site, "tx", otherwise)
+    problem = array_obstacle(data.site, "tx", otherwise)
     if problem is not None:
         return problem
     if not np.allclose(data.rx_rotation, data.rx_rotation[0], atol=1e-6):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Query
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
+from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 from gsparc.field.model import FULL_SPHERE_ROWS, RasterSettings
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
@@ -67,15 +67,15 @@ class GaussianNetwork(Network):
         return self.field.cloud(strengths, "emission of a Gaussian")
 
 
-def gaussians_of(scene: Scene, count: int) -> GaussianField:
+def initial_gaussians(scene: Scene, count: int) -> GaussianField:
     """Draw them where `FieldSettings` says: around a static receiver, else in and about the box."""
     static = scene.receiver
     place, turn = (None, None) if static is None else (static.position, static.rotation)
     init: Literal["uniform", "sphere"] = "uniform" if static is None else "sphere"
-    return initial_field(FieldSettings(count, init), scene.box, place, turn)
+    return create_field(FieldSettings(count, init), scene.box, place, turn)
 
 
-def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
+def rendering_options(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
     """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     least = RasterSettings().relative_cutoff

@@ -30,8 +30,8 @@ from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
     GaussianPeer,
-    gaussians_of,
-    rendering_of,
+    initial_gaussians,
+    rendering_options,
 )
 from gsparc.models.peers.trained import Scene, magnitude
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
@@ -45,9 +45,9 @@ class ComplexGaussians(GaussianNetwork):
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight
         self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
-        self.field = gaussians_of(scene, count)
-        self.grid, self.options = rendering_of(scene)
-        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
+        self.field = initial_gaussians(scene, count)
+        self.grid, self.options = rendering_options(scene)
+        self.coefficients = nn.Parameter(0.02 * torch.randn(count, count_terms(self.degree, self.order), 2))
         with torch.no_grad():
             # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
@@ -137,7 +137,7 @@ class GSRF(GaussianPeer):
     rate: float = 8e-3
 
 
-def terms(degree: int, order: int) -> int:
+def count_terms(degree: int, order: int) -> int:
     """Return the number of terms of `fourier_legendre`."""
     return (degree + 1) * (2 * order + 1)
 

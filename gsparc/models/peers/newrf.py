@@ -138,14 +138,14 @@ class NeWRF(TrainedPeer):
             )
         places = data.rx_position[rows]
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
-        centres, seen = virtual_transmitters(places, rays)
+        centres, seen = locate_transmitters(places, rays)
         if not len(centres):
             raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
         found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
-        return {**found, "votes": votes(seen, len(centres))}
+        return {**found, "votes": count_votes(seen, len(centres))}
 
 
-def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return points where rays of several receivers meet, and which of them every receiver sees.
 
     Args:
@@ -198,7 +198,7 @@ def _merged(points: np.ndarray) -> np.ndarray:
     return np.stack([np.median(points[rows], axis=0) for rows in clusters if len(rows) >= least])
 
 
-def votes(seen: list[np.ndarray], count: int) -> Tensor:
+def count_votes(seen: list[np.ndarray], count: int) -> Tensor:
     """Return how many rays of each receiver point at each virtual transmitter: (n, V) float32."""
     table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
     return torch.from_numpy(table.astype(np.float32))

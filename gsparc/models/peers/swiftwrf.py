@@ -51,7 +51,7 @@ class PlanarGaussians(GaussianNetwork):
         super().__init__(scene, settings.count)
         assert scene.site.grid is not None
         self.grid, count = scene.site.grid, settings.count
-        base, axes = lattice(self.grid, count)
+        base, axes = sphere_lattice(self.grid, count)
         self.register_buffer("base", base)
         self.register_buffer("axes", axes)
         self.register_buffer("frames", frame_quaternions(axes, base))
@@ -72,7 +72,7 @@ class PlanarGaussians(GaussianNetwork):
         flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
         batch = len(moved)
-        quats = turned_about_normal(self.frames, angle)
+        quats = turn_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
         # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
@@ -101,7 +101,7 @@ class PlanarGaussians(GaussianNetwork):
             raise ValueError("Gaussians of directions around a receiver that moves lie nowhere")
         towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
         means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
-        turned = turned_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
+        turned = turn_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
         own = Rotation.from_matrix(receiver.rotation.numpy())
         quats = own * Rotation.from_quat(turned, scalar_first=True)
         widths = self.log_widths.exp().double().numpy()
@@ -124,7 +124,7 @@ class SwiftWRF(DeformedPeer):
     rate: float = 5e-3
 
 
-def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
+def sphere_lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
     """Return `count` even directions (N, 3) over the grid's part of a sphere, and tangents (N, 2, 3)."""
     low = grid.first_elevation - grid.elevation_step / 2
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
@@ -147,7 +147,7 @@ def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
 
 
-def turned_about_normal(frame: Tensor, half: Tensor) -> Tensor:
+def turn_about_normal(frame: Tensor, half: Tensor) -> Tensor:
     """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.gradient_stage import interruptible, make_trainer, read_result, steps_asked_for
+from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
 from gsparc.field.module import LossSettings, NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
@@ -160,13 +160,13 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: the training set is empty")
         origin = Origin.of(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
-        asked = steps_asked_for(context, len(rows), self.max_steps)
+        asked = requested_steps(context, len(rows), self.max_steps)
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
         self.network = self.makes(_scene(data, rows), self)
         if context.resume is not None:
-            origin.refuse_other(interrupted(context.resume))
+            origin.require_same(read_interrupted(context.resume))
         own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
         module = self.module(max(round(own), 1) if asked is None else asked, context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
@@ -174,7 +174,7 @@ class TrainedPeer(Method):
         trainer, batches = make_trainer(module, data, all_rows, context, files, budget)
         with interruptible(trainer, batches):
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
-        result = read_result(trainer, budget)
+        result = read_trainer_result(trainer, budget)
         self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"

@@ -24,9 +24,9 @@ from gsparc.models.peers.gaussians import (
     Deformation,
     DeformedPeer,
     GaussianNetwork,
-    gaussians_of,
+    initial_gaussians,
     render_each,
-    rendering_of,
+    rendering_options,
 )
 from gsparc.models.peers.trained import Scene
 from gsparc.ops import Pose
@@ -39,8 +39,8 @@ class DeformedGaussians(GaussianNetwork):
 
     def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
         super().__init__(scene, settings.count)
-        self.grid, self.options = rendering_of(scene)
-        self.field = gaussians_of(scene, self.count)
+        self.grid, self.options = rendering_options(scene)
+        self.field = initial_gaussians(scene, self.count)
         self.signals = nn.Parameter(torch.zeros(self.count))
         places = torch.stack(self.field.means.detach().aminmax(dim=0))
         self.deformation = Deformation(places, scene.box, sum(CHANGES), settings)

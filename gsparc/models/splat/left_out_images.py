@@ -39,7 +39,7 @@ class LeftOut(Stored):
     gaps: np.ndarray
     predicted: np.ndarray
 
-    def by_process(self) -> np.ndarray:
+    def predict_by_process(self) -> np.ndarray:
         """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
@@ -54,7 +54,7 @@ class LeftOut(Stored):
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]
 
-    def as_far_as(self, distance: float | None) -> int:
+    def nearest_gap(self, distance: float | None) -> int:
         """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.
 
         Args:

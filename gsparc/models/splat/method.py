@@ -22,10 +22,10 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit, gradient_stage
-from gsparc.field.confidence import ConfidenceSettings, fit_errors
+from gsparc.field.confidence import ConfidenceSettings, fit_error_law
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
-from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
+from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
@@ -36,12 +36,12 @@ from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import Stored
 from gsparc.models.fitting import Origin
-from gsparc.models.method import Method, Prediction, in_double
+from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat import reduce
-from gsparc.models.splat.auto_settings import Choices, resolve, settled
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.models.splat.closed_form_start import prepare
+from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
+from gsparc.models.splat.closed_form_start import initialise
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import restored, stored
@@ -157,9 +157,9 @@ class LearnedField(Method):
         from all of them, with the confidence of the first.
         """
         origin = Origin.of(data, fold, context)
-        left = None if context.resume is None else interrupted(context.resume)
+        left = None if context.resume is None else read_interrupted(context.resume)
         if left is not None:
-            origin.refuse_other(left)
+            origin.require_same(left)
         marks = {} if left is None else left.extra
         budget = context.time_budget(before=Spent(*marks.get("spent", ())))
         self._begin(data, fold, marks)
@@ -175,7 +175,7 @@ class LearnedField(Method):
             )
             with gradient_stage.interruptible(trainer, batches):
                 trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
-            self._end(stage, gradient_stage.read_result(trainer, budget), began, budget)
+            self._end(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
         what = f"final, {self.steps} of {self.steps_taken} steps kept"
         context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
@@ -193,7 +193,7 @@ class LearnedField(Method):
                 lost = f"{data.site.name} does not say where its static end is"
                 raise ValueError(f"{self.name}: {lost}; take model=complex_gp")
             self._shape = (data.target.shape[1], data.target.shape[2])
-        self.choices, reasons = resolve(self.settings, self.init.name, data.site)
+        self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
@@ -213,7 +213,7 @@ class LearnedField(Method):
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
-        asked = gradient_stage.steps_asked_for(context, len(watched.train), self.most_steps)
+        asked = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
         usual = budget.effort.steps_after_solving if solved else budget.effort.steps
         steps = usual if asked is None else asked
         log.info(
@@ -258,9 +258,9 @@ class LearnedField(Method):
         if context.init_from is not None and context.resume is None:
             self._start_from(data.site, context.init_from)
         elif context.resume is None:
-            start = prepare(
+            start = initialise(
                 InitTask(
-                    settled(self.settings, self.choices), self.choices.closed_form, data,
+                    apply_choices(self.settings, self.choices), self.choices.closed_form, data,
                     stage.fold.train, self._receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
@@ -360,7 +360,7 @@ class LearnedField(Method):
 
     def _new_model(self, site: Site) -> GaussianModel:
         assert self.choices is not None
-        settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
+        settings, transmitter = apply_choices(self.settings, self.choices), self._ends.get("tx_position")
         return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
 
     @torch.no_grad()
@@ -375,7 +375,7 @@ class LearnedField(Method):
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
-            model.error.set(*fit_errors(result.unknown.numpy(), error.double().numpy()))
+            model.error.set(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -417,7 +417,7 @@ class LearnedField(Method):
         frozen = seen if isinstance(seen, FrozenArray) else None
         of = int(model.gaussians.version), frozen is None
         if self._doubled is None or self._doubled[0] != of:
-            self._doubled = of, in_double((model, frozen))
+            self._doubled = of, to_double((model, frozen))
         return self._doubled[1]
 
     def _answered(
@@ -441,7 +441,7 @@ class LearnedField(Method):
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None
         if self.frozen is None or self.frozen.version != int(model.gaussians.version):
-            self.frozen = frozen_view(model, rx)
+            self.frozen = freeze_view(model, rx)
         return self.frozen
 
     @torch.no_grad()
@@ -456,11 +456,11 @@ class LearnedField(Method):
 
     # -- what it can do besides ----------------------------------------------------------------------
 
-    def knobs(self) -> tuple[str, ...]:
+    def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduced`."""
-        return reduce.knobs(self.fitted())
+        return reduce.reduction_settings(self.fitted())
 
-    contributions = reduce.contributions
+    reduction_inputs = reduce.reduction_inputs
     reduced = reduce.reduced
 
     # -- storing -----------------------------------------------------------------------------------
@@ -484,7 +484,7 @@ class LearnedField(Method):
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site)
-        edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
+        edit.resize_gaussians(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
         self.frozen = self._doubled = None
 

@@ -12,7 +12,7 @@ from campaigns import compose, spectra
 from omegaconf import OmegaConf
 
 import gsparc
-from gsparc.commands.train import begin
+from gsparc.commands.train import read_inputs
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.experiment.done import (
@@ -113,7 +113,7 @@ def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_pat
 def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
-    begun = begin(config)
+    begun = read_inputs(config)
     return State.of(config, content(begun.module.measurements), begun.split.sha256)
 
 

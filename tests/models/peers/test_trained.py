@@ -18,7 +18,7 @@ from scenes import lobes, room
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.evaluation.experiment.folds import callbacks_of
+from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint, loading
@@ -138,7 +138,7 @@ def test_peers_had_loops_of_their_own(tmp_path):
 
     def taught(folder, *more, **given):
         method, trainer = brief("nerf2", max_steps=99), partial(DEFAULTS, max_steps=30, log_every_n_steps=10)
-        callbacks = [*callbacks_of(compose("model=nerf2").callbacks), *more]
+        callbacks = [*build_callbacks(compose("model=nerf2").callbacks), *more]
         context = FitContext(tmp_path / folder, trainer=trainer, callbacks=lambda: callbacks, **given)
         return method, method.fit(data, fold, context)
 
