@@ -155,7 +155,7 @@ class NetworkModule(L.LightningModule):
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
         """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
         raise NotImplementedError(
-            "a checkpoint holds a whole model: say gsparc.models.loading.module_of(FILE)"
+            "a checkpoint holds a whole model: say gsparc.models.loading.load_module(FILE)"
         )
 
     def configure_optimizers(self) -> Any:

@@ -32,7 +32,7 @@ def run(monkeypatch, tmp_path):
         study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
     )
     monkeypatch.setattr(study.checkpoint, "read", kept.get)
-    monkeypatch.setattr(study.loading, "made_again", lambda factory, stored: stored)
+    monkeypatch.setattr(study.loading, "rebuild_method", lambda factory, stored: stored)
     context = FitContext(tmp_path, seed=5, budget_s=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 
