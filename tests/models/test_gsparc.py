@@ -215,7 +215,8 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    monkeypatch.setattr(solution_weights, "stacking_weights", lambda found, *unused: (1 / len(found),) * len(found))
+    equal = lambda found, *unused: (1 / len(found),) * len(found)  # noqa: E731
+    monkeypatch.setattr(solution_weights, "stacking_weights", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
