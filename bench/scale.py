@@ -29,7 +29,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.method import MethodFactory
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.training.context import FitContext
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
@@ -68,14 +68,14 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold) -> None:
     """Write a line of one method, in the columns of docs/results/scale/powers.csv."""
-    before, private, factory = peak_gb(), Private(), for_stations(make(name), data)
+    before, private, factory = peak_gb(), Private(), by_station(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
         # Both clocks: seconds of the processor do not count what others do meanwhile.
         cpu, wall = time.process_time(), time.perf_counter()
         # All stations are one fit, as rows are what is varied here.
         context = FitContext(Path(folder), stations="together")
-        method, _ = fitting.fit(factory, data, fold, context)
+        method, _ = fitting.fit_or_resume(factory, data, fold, context)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     batch = data.batch(fold.test)
     ratio = method.predict(batch).mean.numpy() / batch.target.numpy()

@@ -8,8 +8,8 @@ from typing import Any
 import lightning.pytorch as L
 
 from gsparc.data.limits import Checked, setting
-from gsparc.field.gradient_stage import stands
-from gsparc.field.schedule import INTERVAL, in_steps
+from gsparc.field.gradient_stage import step_is_complete
+from gsparc.field.schedule import INTERVAL, to_steps
 
 
 @dataclass(eq=False)
@@ -29,8 +29,8 @@ class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after a
         """Write when the schedule says so."""
         step = module.global_step
         # After the last step the state is written in any case, and not here.
-        due = step and step % in_steps(self.interval, module.total_steps) == 0 and step < module.total_steps
-        if due and stands(trainer):
+        due = step and step % to_steps(self.interval, module.total_steps) == 0 and step < module.total_steps
+        if due and step_is_complete(trainer):
             trainer.save_checkpoint(module.run_dir / "last.ckpt")
 
     on_validation_end = on_train_batch_end  # type: ignore[assignment]

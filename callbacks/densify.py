@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
-from gsparc.field.distributed import largest, total
+from gsparc.field.distributed import process_max, process_sum
 from gsparc.field.model import GaussianModel
-from gsparc.field.readout import solved_again
-from gsparc.field.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.field.readout import solve_readout
+from gsparc.field.schedule import INTERVAL, STEPS, acts_at_step, to_steps
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.rendered.raster is None:
             return
-        if module.global_step >= in_steps(self.stop, module.total_steps):
+        if module.global_step >= to_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -85,20 +85,20 @@ class Densify(Checked, L.Callback):
                 if not module.batch.share:  # another process has these rows
                     visible = torch.zeros_like(visible)
                 own = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
-                result, seen = total(own)
+                result, seen = process_sum(own)
             else:  # of one pose the gradient is the sum over rows, and every process sees the same
-                result, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
+                result, seen = (process_sum(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
             self.statistics["gradient"] += result
             self.statistics["seen"] += seen
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
-            self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
+            self.statistics["radius"] = process_max(torch.maximum(self.statistics["radius"], radius.float()))
 
     def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any = None, *unused: Any) -> None:
         """Edit the field when the schedule says so, after the validation of the step before."""
         if not self.statistics or self._ended:
             return
         step = module.global_step
-        if not due(step, self.start, self.stop, self.interval, module.total_steps):
+        if not acts_at_step(step, self.start, self.stop, self.interval, module.total_steps):
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -106,14 +106,14 @@ class Densify(Checked, L.Callback):
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
             planned = self.plan(model, draws, in_place=module.solved)
             before = len(model.gaussians)
-            solved = solved_again(model, planned, batch) if module.solved else None
-            change = 0.0 if solved is None else float(total(solved.change)) ** 0.5
+            solved = solve_readout(model, planned, batch) if module.solved else None
+            change = 0.0 if solved is None else float(process_sum(solved.change)) ** 0.5
             if change > MOST_CHANGE:
                 text = "step %d: no Gaussians added from here on: spectra would change by %.1e, more than %g"
                 log.info(text, step, change, MOST_CHANGE)
                 self._ended = True
                 return
-            edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
+            edit.apply_edit(planned, model, model.gaussians, trainer.optimizers[0])
             if solved is not None:
                 model.emission.weight2.copy_(solved.weight)
                 model.emission.bias2.copy_(solved.bias)

@@ -29,13 +29,13 @@ class CostLedger(L.Callback):
         self._running_since: float | None = None
 
     @staticmethod
-    def paused_in(trainer: L.Trainer) -> AbstractContextManager[None]:
+    def pause_ledger(trainer: L.Trainer) -> AbstractContextManager[None]:
         """Pause the trainer's ledger, if it has one, for work that is not training."""
         ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
         return ledgers[0].paused() if ledgers else nullcontext()
 
     @staticmethod
-    def seconds_in(trainer: L.Trainer) -> float | None:
+    def training_seconds(trainer: L.Trainer) -> float | None:
         """Return seconds on the trainer's ledger [s]; None when it keeps none."""
         ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
         return ledgers[0].elapsed() if ledgers else None
@@ -98,7 +98,7 @@ class CostLedger(L.Callback):
         step, loss = trainer.global_step, trainer.callback_metrics.get("train/task_loss")
         shown = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
         # What was solved before the first step is part of what an accuracy costs.
-        row = curve.point(
+        row = curve.curve_row(
             module.prepared_seconds + self.seconds, f"step {step}" if step else module.start,
             module.figures["val/error"], step, num_gaussians=module.count,
             **shown, **({} if loss is None else {"train/task_loss": float(loss)}),

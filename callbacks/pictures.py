@@ -12,7 +12,7 @@ import torch
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
-from gsparc.field.schedule import INTERVAL, in_steps
+from gsparc.field.schedule import INTERVAL, to_steps
 from gsparc.training.tracking import log_picture
 
 
@@ -38,7 +38,7 @@ class Pictures(Checked, L.Callback):
         step = trainer.global_step
         if not trainer.is_global_zero or module.site.kind != "spectrum":
             return
-        if step % in_steps(self.every, module.total_steps) and step != trainer.max_steps:
+        if step % to_steps(self.every, module.total_steps) and step != trainer.max_steps:
             return
         data = trainer.datamodule  # type: ignore[attr-defined]
         candidates = data.fold.val
@@ -46,10 +46,10 @@ class Pictures(Checked, L.Callback):
             return
         # The same rows at every step, so that pictures can be compared.
         rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
-        with CostLedger.paused_in(trainer), torch.no_grad():
+        with CostLedger.pause_ledger(trainer), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
             predicted = module.mean(batch)
-            seconds = CostLedger.seconds_in(trainer)
+            seconds = CostLedger.training_seconds(trainer)
             title = f"validation, step {step}" + ("" if seconds is None else f", {seconds:.0f} s of training")
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
             true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()

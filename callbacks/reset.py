@@ -11,7 +11,7 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.data.limits import SHARE, Checked, setting, whole
-from gsparc.field.schedule import INTERVAL, STEPS, due, in_steps
+from gsparc.field.schedule import INTERVAL, STEPS, acts_at_step, to_steps
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
@@ -55,8 +55,8 @@ class OpacityReset(Checked, L.Callback):
         step = module.global_step
         if module.solved or module.total_steps < self.least_steps:
             return
-        interval = in_steps(self.interval, module.total_steps)
-        if not due(step, 1, self.stop, self.interval, module.total_steps):
+        interval = to_steps(self.interval, module.total_steps)
+        if not acts_at_step(step, 1, self.stop, self.interval, module.total_steps):
             return
         if step + interval > module.total_steps:
             left = module.total_steps - step

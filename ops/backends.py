@@ -14,18 +14,18 @@ class BackendUnavailable(RuntimeError):
     """The requested backend is not available; the message says why."""
 
 
-def choose(name: str | None, device: torch.device) -> ModuleType:
+def choose_backend(name: str | None, device: torch.device) -> ModuleType:
     """Return the backend called `name`, or the one of `device` (BackendUnavailable, ValueError)."""
     if name is None:
         name = device.type
-    backend = named(name)
+    backend = backend_named(name)
     # The reference runs wherever torch does.
     if name in ("cpu", "cuda") and device.type != name:
         raise BackendUnavailable(f"backend {name!r} needs tensors on {name}, these are on {device}")
     return backend
 
 
-def named(name: str) -> ModuleType:
+def backend_named(name: str) -> ModuleType:
     """Return the backend called `name` (BackendUnavailable, ValueError).
 
     >>> named("tpu")

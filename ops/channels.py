@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsparc.ops import calls
 from gsparc.ops.operators import KERNELS, contiguous, differentiable, register_kernel, run_kernel
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import needs_reference
 
 
 def channels(
@@ -55,13 +55,13 @@ def channels(
     if subcarriers < 0:
         raise ValueError(f"{subcarriers} subcarriers are none: give 0 or more")
     tones = [first_hz, step_hz]
-    served = not beyond_kernels(gains, steering, delays)
+    served = not needs_reference(gains, steering, delays)
     if served and calls.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
         return differentiable(_outputs, _gradients, (tones, subcarriers), gains, steering, delays)
-    return summed(gains, steering, delays, tones, subcarriers)
+    return plain_channels(gains, steering, delays, tones, subcarriers)
 
 
-def summed(
+def plain_channels(
     gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float], subcarriers: int
 ) -> Tensor:
     """Return the same (B, A, K, 2) in plain PyTorch; the reference. `tones`: first and spacing [Hz]."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends
 from gsparc.ops.geometry import SphereGrid
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import needs_reference
 
 
 class StalePlan(RuntimeError):
@@ -61,7 +61,7 @@ class FrozenPlan:
         return self._render(seen, picked=True)
 
     def _render(self, features: Tensor, *, picked: bool) -> Tensor:
-        if beyond_kernels(features):
+        if needs_reference(features):
             raise RuntimeError(
                 "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
             )
@@ -77,6 +77,6 @@ class FrozenPlan:
         if features.dim() not in (2, 3):
             raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
         batch = features if features.dim() == 3 else features.unsqueeze(0)
-        image = backends.named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
+        image = backends.backend_named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
         # The first and last of (B, N, C): B and C.
         return image.unflatten(0, batch.shape[::2]) if features.dim() == 3 else image

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends, calls
 from gsparc.ops.operators import contiguous, differentiable, empty_like, register_kernel, run_kernel
-from gsparc.ops.transforms import beyond_kernels, full_precision
+from gsparc.ops.transforms import full_precision, needs_reference
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -29,8 +29,8 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     """
     _check(encoded, Layers(weight1, bias1, weight2, bias2))
     encoded = encoded.to(weight1.dtype)  # it comes in half precision from `torch.autocast`
-    if encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2):
-        return products(encoded, weight1, bias1, weight2, bias2)
+    if encoded.requires_grad or needs_reference(encoded, weight1, bias1, weight2, bias2):
+        return plain_networks(encoded, weight1, bias1, weight2, bias2)
     kernels = calls.kernels()
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
     if fits and encoded.is_cuda:
@@ -38,13 +38,13 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         # The CUDA kernel has room for so many inputs and outputs.
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
-        backends.named(encoded.device.type)  # loads its kernels
+        backends.backend_named(encoded.device.type)  # loads its kernels
         return differentiable(_outputs, _gradients, None, encoded, weight1, bias1, weight2, bias2)
-    return products(encoded, weight1, bias1, weight2, bias2)
+    return plain_networks(encoded, weight1, bias1, weight2, bias2)
 
 
 @full_precision
-def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+def plain_networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """Return the same (B, N, C) as matrix products; the reference."""
     count, width, hidden = weight1.shape
     # One product for all Gaussians: the encoded position is the same for each of them.

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from gsparc.ops import calls
 from gsparc.ops.operators import contiguous
-from gsparc.ops.transforms import followed
+from gsparc.ops.transforms import is_differentiated
 
 
-def served(*tensors: Tensor) -> bool:
+def has_query_kernel(*tensors: Tensor) -> bool:
     """Tell whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
-    plain = all(part.device.type == "cpu" for part in tensors) and not followed(*tensors)
+    plain = all(part.device.type == "cpu" for part in tensors) and not is_differentiated(*tensors)
     return plain and calls.kernels() is not None
 
 

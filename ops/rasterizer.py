@@ -14,7 +14,7 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.projection import Projection
 from gsparc.ops.results import Plan, Raster, Weights
 from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, kernel_settings
-from gsparc.ops.transforms import beyond_kernels, followed, plain, unfollowed
+from gsparc.ops.transforms import detached, is_differentiated, needs_reference, no_transforms
 
 
 def make_plan(
@@ -52,7 +52,7 @@ def make_plan(
         ValueError, TypeError: for invalid shapes, dtypes, devices or values.
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
-    gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+    gaussians = validation.check_gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
     return _plan(gaussians, ids, pose, grid, optics, backend)
 
@@ -68,20 +68,20 @@ def _plan(
     """`make_plan` of Gaussians whose shapes agree."""
     # Read before `plain`, which takes gradients off: a pose's would then be none without a word.
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
-    validation.transforms(gaussians, pose, pose_trained)
-    chosen = backends.choose(backend, gaussians.means.device)
-    with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), unfollowed():
+    validation.check_transforms(gaussians, pose, pose_trained)
+    chosen = backends.choose_backend(backend, gaussians.means.device)
+    with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), no_transforms():
         # Order and visibility are choices without a derivative: neither autograd nor `torch.func` sees them.
-        still = Gaussians._make(map(plain, gaussians))
-        poses = validation.poses(Pose(plain(pose.position), plain(pose.rotation)), still.means)
-        plan = chosen.make_plan(validation.strongest(still), plain(ids), poses, grid, optics)
+        still = Gaussians._make(map(detached, gaussians))
+        poses = validation.check_poses(Pose(detached(pose.position), detached(pose.rotation)), still.means)
+        plan = chosen.make_plan(validation.strongest_opacity(still), detached(ids), poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
 
 def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
-    gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
-    validation.transforms(gaussians, plan.pose, plan.pose_trained)
+    gaussians = validation.check_gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
+    validation.check_transforms(gaussians, plan.pose, plan.pose_trained)
     if plan.num_gaussians != len(gaussians.means):
         raise ValueError(
             f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"
@@ -121,14 +121,14 @@ def composite(
         RuntimeError: gradients over a plan that was made in `torch.inference_mode`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
-    values = validation.features(features, means, plan.pose)
+    values = validation.features_per_pose(features, means, plan.pose)
     validation.check_features(features)
     # Kernels have first derivatives in reverse mode alone.
-    plain = beyond_kernels(*gaussians, features)
+    plain = needs_reference(*gaussians, features)
     trained = _trained(plan, *gaussians, features) and not plain
     # A leaf of its own: after `backward` its `.grad` is the screen-space gradient that densification reads.
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
-    backend = reference_by_rows if plain else backends.named(plan.backend)
+    backend = reference_by_rows if plain else backends.backend_named(plan.backend)
     image, transmittance = backend.composite(plan, gaussians, values, means2d)
     return Raster(image, transmittance, plan.radii, plan.visible, means2d)
 
@@ -164,15 +164,15 @@ def rasterize(
     >>> bool(torch.allclose(raster.image[0], 1 - raster.transmittance, atol=1e-6))  # one feature, of 1
     True
     """
-    chosen = backends.choose(backend, means.device)
+    chosen = backends.choose_backend(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
     inputs = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
-    gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+    gaussians = validation.check_gaussians(means, quats, scales, opacities, extinctions, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
     # Only without gradients: one call keeps no plan that a backward pass could read.
-    if at_once is not None and not followed(*inputs):
-        poses = validation.poses(pose, means)
-        values = validation.features(features, means, poses)
+    if at_once is not None and not is_differentiated(*inputs):
+        poses = validation.check_poses(pose, means)
+        values = validation.features_per_pose(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
     plan = _plan(gaussians, ids, pose, grid, optics, backend)
     return composite(plan, means, quats, scales, opacities, features, extinctions=extinctions)
@@ -195,7 +195,7 @@ def mean_weights(
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     # Called for its refusal of plans that were made in inference mode.
     _trained(plan, *gaussians)
-    backend = reference_by_rows if beyond_kernels(*gaussians) else backends.named(plan.backend)
+    backend = reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
     return Weights(*backend.mean_weights(plan, gaussians))
 
 
@@ -223,7 +223,7 @@ def freeze(
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     # To `torch.func` a frozen view would be a constant, its derivative 0 without a word.
-    if beyond_kernels(*gaussians):
+    if needs_reference(*gaussians):
         raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")
-    order, buffers = backends.named(plan.backend).freeze(plan, gaussians)
+    order, buffers = backends.backend_named(plan.backend).freeze(plan, gaussians)
     return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

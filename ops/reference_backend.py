@@ -18,7 +18,7 @@ from gsparc.ops.transforms import full_precision
 @full_precision
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Find depth order and radii; compositing evaluates the footprints again, differentiably."""
-    validation.finite(gaussians, pose)
+    validation.check_finite(gaussians, pose)
     means, quats, scales, strongest, _ = gaussians
     orders, centers, radii, visible = [], [], [], []
     for index in range(len(pose)):

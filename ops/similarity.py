@@ -9,13 +9,13 @@ from torch import Tensor
 
 from gsparc.ops import calls
 from gsparc.ops.operators import register_kernel, run_kernel
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import needs_reference
 
 
-def served(images: Tensor) -> bool:
+def has_similarity_kernel(images: Tensor) -> bool:
     """Tell whether a kernel supports these images: float32, on a device whose kernels are loaded."""
     device = images.device.type
-    if beyond_kernels(images):
+    if needs_reference(images):
         return False
     loaded = device in calls.libraries or (device == "cpu" and calls.kernels() is not None)
     return images.dtype == torch.float32 and loaded

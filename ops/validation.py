@@ -12,11 +12,11 @@ from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
 from gsparc.ops.transforms import (
     carries_tangent,
-    differentiated_forward,
+    forward_mode_is_active,
     full_precision,
-    mapped,
-    transforming,
-    unwrapped,
+    has_vmap_axis,
+    transform_is_active,
+    unwrap,
 )
 
 
@@ -32,7 +32,7 @@ class UnsoundGaussian(ValueError):
         self.index = index
 
 
-def gaussians(
+def check_gaussians(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
@@ -60,20 +60,20 @@ def gaussians(
     return result
 
 
-def transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:
+def check_transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:
     """Refuse a pose whose gradient is asked for, which would be none, and Gaussians under `torch.vmap`."""
-    if not pose_trained and not transforming() and not differentiated_forward():
+    if not pose_trained and not transform_is_active() and not forward_mode_is_active():
         return
     ends = (pose.position, pose.rotation)
     if (pose_trained and torch.is_grad_enabled()) or carries_tangent(*ends):
         raise ValueError("a pose has no gradients here: detach it, or move the Gaussians instead")
-    if mapped(*gaussians, *ends):
+    if has_vmap_axis(*gaussians, *ends):
         raise ValueError(
             "torch.vmap over Gaussians or poses is not possible: give P poses, or features (B, N, C)"
         )
 
 
-def finite(gaussians: Gaussians, pose: Pose) -> None:
+def check_finite(gaussians: Gaussians, pose: Pose) -> None:
     """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
     if not bool((_wrongness(pose) <= 1).all()):  # NaN is not either
         raise_for_pose(pose)
@@ -101,7 +101,7 @@ def _wrongness(pose: Pose) -> Tensor:
     return torch.stack([far, products, across.abs().amax(1) / (2 * SKEW)]).amax(0)
 
 
-def strongest(gaussians: Gaussians) -> Gaussians:
+def strongest_opacity(gaussians: Gaussians) -> Gaussians:
     """Take max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
     opacities, extinctions = gaussians.opacities, gaussians.extinctions
     if extinctions is None:
@@ -148,7 +148,7 @@ def raise_for_ids() -> None:
     raise ValueError("Gaussians at one distance have equal ids, so nothing orders them; give each its own id")
 
 
-def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
+def features_per_pose(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
     """Return features (N, C) or (B, N, C) as (B, N, C), one a Gaussian and pose (ValueError, TypeError)."""
     _check_dtype_and_device("features", values, means)
     if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
@@ -167,7 +167,7 @@ def check_features(values: Tensor, rows: Tensor | None = None) -> None:
     """Check that features (..., N, C) on the CPU are finite (UnsoundGaussian; of `rows` (N,) where given)."""
     if values.device.type != "cpu":  # a GPU is not waited for: NaN stays NaN
         return
-    numbers, axis = unwrapped(values, values.dim() - 2)
+    numbers, axis = unwrap(values, values.dim() - 2)
     if not math.isfinite(numbers.sum().item()):  # one pass; a sum may overflow where no number does
         bad = (~torch.isfinite(numbers)).movedim(axis, 0).flatten(1).any(1)
         if bool(bad.any()):
@@ -188,14 +188,14 @@ def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
     return seen.transpose(0, 1).reshape(seen.shape[1], values.shape[0] * values.shape[2])
 
 
-def poses(pose: Pose, means: Tensor) -> Pose:
+def check_poses(pose: Pose, means: Tensor) -> Pose:
     """Return poses (P,) in the Gaussians' dtype, on their device (TypeError); the plan checks values."""
     for name, part in vars(pose).items():
         if part.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"a pose needs float32 or float64, got a {name} in {part.dtype}; convert it")
     ends = (pose.position, pose.rotation)
     fits = all(t.dtype == means.dtype and t.device == means.device for t in ends) and pose.batched
-    if fits and not transforming() and not any(t.requires_grad or not t.is_contiguous() for t in ends):
+    if fits and not transform_is_active() and not any(t.requires_grad or not t.is_contiguous() for t in ends):
         return pose  # as most often: what follows takes longer than planning a hundred Gaussians
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()

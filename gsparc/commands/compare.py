@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import run_directory, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, plain
-from gsparc.commands.train import begin, train
+from gsparc.commands.train import read_inputs, train
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells, plugin_contenders
-from gsparc.evaluation.experiment.fitting import Filled, Prepared, fill_all, prepare
+from gsparc.evaluation.experiment.fitting import CellResult, PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.latency import Latency, time_by_dataset
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
@@ -55,14 +55,14 @@ def task(config: DictConfig) -> pd.DataFrame:
     ]
     own = {name: of or {} for name, of in settings["datasets"].items()}
     prepared = [
-        prepare(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
+        prepare_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
         for problem, cell in plan_cells(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     log.info("cells are in %s", cells_dir)
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
-        filled = fill_all(prepared, train_cell, bool(settings["train"]), limit_s)
+        filled = run_cells(prepared, train_cell, bool(settings["train"]), limit_s)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
@@ -70,18 +70,18 @@ def task(config: DictConfig) -> pd.DataFrame:
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
-def train_cell(one: Prepared, left: str | None) -> None:
+def train_cell(one: PreparedCell, left: str | None) -> None:
     """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
     config = deepcopy(one.config)
     # What an interrupted try has left is gone on from, unless the settings name something else.
     config.ckpt_path = config.ckpt_path or left
-    _, made = train(config, one.folder, begin(config, one.problem.data), in_full=False)
+    _, made = train(config, one.folder, read_inputs(config, one.problem.data), in_full=False)
     for file in made.checkpoints if one.problem.draw else ():  # queries are timed with those of the first
         file.unlink()
 
 
 def write_comparison(
-    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path,
+    filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path,
     figures: Sequence[str] = (),
 ) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.

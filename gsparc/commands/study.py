@@ -18,7 +18,7 @@ from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, measurements_hash
-from gsparc.evaluation.experiment.folds import context_of
+from gsparc.evaluation.experiment.folds import fit_context
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Condition, Study
 from gsparc.evaluation.summary import run_conditions, write_samples
@@ -61,7 +61,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     try:
         # Rounds that were done on other data, splits or settings do not count as these.
         state = State.of(config, measurements_hash(data), split.sha256)
-        rows = study.run(data, split, context_of(config, run_dir=run_dir), state)
+        rows = study.run(data, split, fit_context(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
         raise KeyboardInterrupt(message) from None

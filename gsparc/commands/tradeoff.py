@@ -25,9 +25,9 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.pareto import Point, front
-from gsparc.models.reduced import combinations, reduced
+from gsparc.models.reduced import reduce_method, setting_combinations
 from gsparc.prediction import operating_point
+from gsparc.prediction.pareto import Point, front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, reference_copy
 from gsparc.training import tracking
@@ -52,12 +52,12 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     rows = rows_to_score(fold, config.eval_on)
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    measured = method.contributions(data, learned)
-    settings = list(combinations(method, plain(config.grid)))
+    measured = method.reduction_inputs(data, learned)
+    settings = list(setting_combinations(method, plain(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
-    candidates = [(some, reduced(method, some, measured)) for some in settings]
+    candidates = [(some, reduce_method(method, some, measured)) for some in settings]
     others = tradeoff.fit_others(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
@@ -90,7 +90,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     }  # fmt: skip
     front_rows = table_of_points[table_of_points.front == 1].to_dict("records")
     sheet = Table.of(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
-    with tracking.opened(config) as loggers:
+    with tracking.open_loggers(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.log_table(loggers, "operating points", *sheet.texts())
     finish_run(run_dir, facts, sheet, lines=tradeoff.why_irreducible(method))

@@ -34,8 +34,14 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import State, measurements_hash, program_hash, read_finished, run_once
-from gsparc.evaluation.experiment.folds import Outcome, context_of, fit_folds, in_folders
+from gsparc.evaluation.experiment.done import (
+    State,
+    measurements_hash,
+    program_hash,
+    read_finished,
+    recorded,
+)  # fmt: skip
+from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import DECIDING, score_of
 from gsparc.evaluation.open_runs import align_to_site
@@ -43,7 +49,7 @@ from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.registry import build, complete, known
+from gsparc.models.registry import all_methods, build, fill_defaults
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -60,7 +66,7 @@ LEFT = (
 
 
 @dataclass(frozen=True)
-class Objects:
+class TrainedRun:
     """What a run made, for callers from Python.
 
     Attributes:
@@ -78,7 +84,7 @@ class Objects:
 
 
 @dataclass(frozen=True)
-class Begun:
+class RunInputs:
     """What a run begins with, before anything is fitted.
 
     Attributes:
@@ -95,7 +101,7 @@ class Begun:
     watch: TimeBudget
 
 
-def begin(config: DictConfig, known: Measurements | None = None) -> Begun:
+def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInputs:
     """Check the settings and read the data; nothing is written.
 
     Args:
@@ -105,17 +111,17 @@ def begin(config: DictConfig, known: Measurements | None = None) -> Begun:
     Raises:
         ValueError: bad data or settings, one line each.
     """
-    method = build(complete(config.model))  # once: each fold, and each station, fits a copy of it
+    method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.of(config)
     watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
     with heeded.recording(reads):
         module = _data(config, known)
-        return Begun(method, module, split_for(plain(config.split), module.measurements), reads, watch)
+        return RunInputs(method, module, split_for(plain(config.split), module.measurements), reads, watch)
 
 
 def train(
-    config: DictConfig, run_dir: Path, begun: Begun | None = None, *, in_full: bool = True
-) -> tuple[dict[str, Any], Objects]:
+    config: DictConfig, run_dir: Path, begun: RunInputs | None = None, *, in_full: bool = True
+) -> tuple[dict[str, Any], TrainedRun]:
     """Fit a method on every fold of a split, test it beside baselines, and write it all down.
 
     The folder is locked meanwhile. What an earlier run left there is set aside first, but for what this one
@@ -135,7 +141,7 @@ def train(
     """
     with locked(run_dir):
         _set_earlier_aside(config, run_dir)
-        begun = begun or begin(config)
+        begun = begun or read_inputs(config)
         method, reads, split, data = begun.method, begun.reads, begun.split, begun.module.measurements
         run_id = summary.new_run_id()
         resumes = _resumes(config, len(split.folds))
@@ -144,12 +150,12 @@ def train(
             _say(config, method, data, split)
         write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
 
-        with tracking.opened(config) as loggers:
-            whole = context_of(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
+        with tracking.open_loggers(config) as loggers:
+            whole = fit_context(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
             with heeded.recording(reads), _advising(contexts):
-                # `Method.fit` of every fold. For gradient steps `run_stage` (field/gradient_stage.py) makes
-                # the Trainer of `config.trainer` and calls `trainer.fit(module, datamodule)`.
+                # `Method.fit` of every fold; what takes gradient steps (models/splat/method.py) makes the
+                # Trainer of `config.trainer` there and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
                 fits = fit_folds(method, data, split, contexts, keep=keep)
                 # Some options are read by answers alone: one query, before unused options are listed.
@@ -166,7 +172,7 @@ def train(
             facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
             facts["program"] = program_hash(plain(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
-            objects = Objects(fits.methods, files, data, split, evaluation)
+            objects = TrainedRun(fits.methods, files, data, split, evaluation)
             if in_full:
                 _draw(loggers, config, facts, objects, run_dir)
         if evaluation.columns:
@@ -214,7 +220,7 @@ def _resumes(config: DictConfig, folds: int) -> list[Path | None]:
     path = None if config.ckpt_path is None else Path(config.ckpt_path)
     if path is None or folds == 1:
         return [path] * folds
-    run = fitting.folder_of(path, fitting.FOLDS)
+    run = fitting.run_folder(path, fitting.FOLDS)
     every = [run / f"fold{number}" for number in range(folds)]
     # A file that belongs to no fold says nothing of where the other folds stand.
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
@@ -263,7 +269,7 @@ def _of_folds(
     Args:
         read_s: that reading took [s]: the seconds that are given begin with the first read.
     """
-    contexts = in_folders(whole, split) if len(resumes) > 1 else [whole]
+    contexts = fold_contexts(whole, split) if len(resumes) > 1 else [whole]
     contexts = [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
     if whole.budget_s is not None:
         # Reading is charged to the first fold: the others find the data read.
@@ -294,7 +300,7 @@ def _keep(
         log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
         context.curve(report.seconds, fitted.name)
-    marks = fitting.marks(report, data, split.folds[number], context)
+    marks = fitting.checkpoint_marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
@@ -302,67 +308,24 @@ def _keep(
 def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
     plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
-    kind = known().get(method.name)
-    return (
-        method.name if plainly and kind and plain(config.model) == config_node(import_target(kind)) else None
-    )
-
-
-def _of_fits(fits: Outcome) -> dict[str, Any]:
-    cpu_s = statistics.fmean(fits.train_cpu_s)
-    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
-    said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
-    facts["model/learned"] = "\n".join(said) or None
-    if fits.cost.stages:
-        facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
-    return facts
-
-
-def _draw(
-    loggers: list[Any], config: DictConfig, facts: dict[str, Any], objects: Objects, run_dir: Path
-) -> None:
-    """Draw predictions and what was found; give loggers the pictures, figures and the table."""
-    # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
-    own = {
-        f"final/{name}": value
-        for name, value in facts.items()
-        if isinstance(value, (int, float)) and not name.startswith("baseline/")
-    }
-    tracking.log_final(loggers, own)
-    method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
-    if len(fold.test):
-        title = f"{data.site.name}: test rows of {method.label}"
-        draw_predictions(method, data, fold, title, run_dir / "test.png")
-        tracking.log_picture(loggers, "test rows", run_dir / "test.png")
-    table = summary.results_table(facts, str(facts["model/label"]), prefix=config.eval_on)
-    tracking.log_table(loggers, "results", *table.texts())
-    found = method.objects()
-    if len(found):
-        draw_found(data, found, run_dir / "found.png", _known_walls(config))
-        tracking.log_picture(loggers, "found", run_dir / "found.png")
-
-
-def task(config: DictConfig) -> float:
-    """Train as configured and show the table; a job of a multirun is done once, see `run_once`.
-
-    Returns:
-        The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
-            NaN where the data, or `split=none`, do not tell it and no search asks.
-    """
-    hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
-    if config.ckpt_path is not None:
-        words = " ".join(hydra.overrides.task)
-        log.info("with the settings of the run that it goes on from: %s", words)
-    with locked(run_dir / ".job"):  # the run's own is its training's
-        unread = State.unread(config) if job else None
+    kind = all_methods().get(method.name)
+    same = kind is not None and plain(config.model) == config_node(import_target(kind))
+    return method.name if plainly and same else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
+        if facts is None:
+            begun = read_inputs(config)
+            state = State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
+            facts = read_finished(run_dir, state, config.reuse) if job else None
         if facts is not None:
             log.info("%s: was done before", run_dir)
         else:
-            begun = begin(config)
-            state = State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
-            work, how = partial(_train_and_show, config, begun), {"reuse": config.reuse, "again": not job}
-            facts = run_once(run_dir, state, work, unread=unread, **how)
+            with recorded(run_dir, state, unread) as left:
+                config.ckpt_path = config.ckpt_path or left
+                facts, objects = train(config, run_dir, begun)
+                made = f"{objects.data.site.name}, split {objects.split.name}"
+                title = f"{made}, {config.eval_on}, seed {config.seed}"
+                table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
+                show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
     figure = DECIDING[facts["dataset/kind"]]
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
@@ -371,15 +334,6 @@ def task(config: DictConfig) -> float:
     if job and hydra.runtime.choices["hydra/sweeper"] != "basic":
         raise ValueError(f"{config.eval_on}/{figure}: these data do not tell what the search improves")
     return math.nan  # only a search asks for it
-
-
-def _train_and_show(config: DictConfig, begun: Begun, left: str | None) -> None:
-    """Train, from what an interrupted try has left where nothing else is said."""
-    run_dir, config.ckpt_path = run_directory(), config.ckpt_path or left
-    facts, objects = train(config, run_dir, begun)
-    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    results = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-    show_result(run_dir, results, lines=summary.remarks(facts, config.eval_on))
 
 
 def main() -> None:

@@ -102,7 +102,7 @@ def evaluate(
     others = {n: same if n == shared else fit_baseline(n, data, split, eval_on, learned) for n in names}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
-    alone = [method.field_alone() for method in methods]
+    alone = [method.without_process() for method in methods]
     fields = [one for one in alone if one is not None]
     # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):

@@ -18,7 +18,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.folds import counted
+from gsparc.evaluation.experiment.folds import effort_settings
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
@@ -91,7 +91,10 @@ class Opened:
         if "model" not in config:
             raise DataError(f"{self.stored[0].path} does not say how it was trained")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
-        factory, context = build(config["model"], trusted=False), FitContext(**counted(config) | others)
+        factory, context = (
+            build(config["model"], trusted=False),
+            FitContext(**effort_settings(config) | others),
+        )
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
 

@@ -12,7 +12,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.sector_levels import draw_sector_levels
-from gsparc.models.method import Method, predictions
+from gsparc.models.method import Method, predict_in_batches
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
 SPECTRA = 4  # test rows drawn
@@ -24,8 +24,8 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     # Spread over the fold: rows beside each other in a file were measured beside each other.
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
-    told = list(predictions(method, data, rows))
-    # `predictions` goes station by station: back in the order of rows.
+    told = list(predict_in_batches(method, data, rows))
+    # `predict_in_batches` goes station by station: back in the order of rows.
     back = np.argsort(np.concatenate([chosen for chosen, _, _ in told]))
     true = np.concatenate([batch.target.numpy() for _, batch, _ in told])[back]
     predicted = np.concatenate([said.mean.numpy() for _, _, said in told])[back]

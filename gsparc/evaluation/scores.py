@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
-from gsparc.models.method import Method, predictions
+from gsparc.models.method import Method, predict_in_batches
 
 SUBSETS = ("train", "val", "test")
 # 64 spectra of 90 x 360 pixels take 8 MB in float32, and their targets as much.
@@ -114,7 +114,7 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
     turn = torch.ones(len(rows), dtype=torch.complex64)
     for run in runs:
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
-        for _, batch, said in predictions(method, data, rows[mine], CHUNK):
+        for _, batch, said in predict_in_batches(method, data, rows[mine], CHUNK):
             # complex128: a sum over many rows and entries loses digits in complex64.
             product = (said.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
@@ -153,7 +153,7 @@ def score_methods(
         metric = metrics_for(data.site.scored, data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
         order = []
-        for chosen, batch, prediction in predictions(method, data, rows, CHUNK):
+        for chosen, batch, prediction in predict_in_batches(method, data, rows, CHUNK):
             mean = prediction.mean if turn is None else prediction.mean * turn[chosen, None, None]
             metric.update(mean, batch.target, batch.mask)
             for name, values in outputs.items():

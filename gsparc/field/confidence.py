@@ -69,7 +69,7 @@ class ErrorModel(nn.Module):
         self.far, self.power = (float(value) for value in state)
 
 
-def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
     The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
@@ -131,7 +131,7 @@ class Confidence(nn.Module):
         return ((g - low) / (high - low)).clamp(0, 1) * torch.exp(-outside)
 
 
-def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
+def confidence_weighted_loss(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
     """Return C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
 
     log C = log(1 + e^g) is a softplus, finite and with a finite slope for every g.

@@ -71,38 +71,38 @@ class SummedGradients(DDPStrategy):
         """Sum gradients, before they are unscaled, clipped and used."""
         if not self._accumulating:
             assert self.lightning_module is not None
-            add_up(p for p in self.lightning_module.parameters() if p.requires_grad)
+            sum_gradients(p for p in self.lightning_module.parameters() if p.requires_grad)
 
 
 @torch.no_grad()
-def add_up(parameters: Iterable[Tensor]) -> None:
+def sum_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
     every = list(parameters)
     own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
     # Sent along: a parameter without a gradient in this process may have one in another.
     has = own[0].new_tensor([p.grad is not None for p in every])
-    flat = total(torch.cat([has, *(gradient.flatten() for gradient in own)]))
+    flat = process_sum(torch.cat([has, *(gradient.flatten() for gradient in own)]))
     sums = flat[len(every) :].split([gradient.numel() for gradient in own])
     for parameter, somewhere, result in zip(every, flat[: len(every)].tolist(), sums, strict=True):
         parameter.grad = result.view_as(parameter).to(parameter.dtype) if somewhere else None
 
 
-def count() -> int:
+def process_count() -> int:
     """Return how many processes train."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
-def total(values: Tensor) -> Tensor:
+def process_sum(values: Tensor) -> Tensor:
     """Sum over processes, in place; the values themselves where there is one."""
     return _reduced(values, ReduceOp.SUM)
 
 
-def largest(values: Tensor) -> Tensor:
+def process_max(values: Tensor) -> Tensor:
     """Return the maximum over processes, in place; the values themselves where there is one."""
     return _reduced(values, ReduceOp.MAX)
 
 
-def agreed(value: float, trainer: L.Trainer) -> float:
+def first_process_value(value: float, trainer: L.Trainer) -> float:
     """Return the first process's value: clocks differ, and all must decide alike."""
     if not distributed.is_initialized():
         return value

@@ -39,7 +39,9 @@ def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
     return rows
 
 
-def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Optimizer | None = None) -> None:
+def apply_edit(
+    edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Optimizer | None = None
+) -> None:
     """Edit all per-Gaussian state at once.
 
     Appended rows start with zero Adam moments and get fresh ids; kept rows stay bit-identical.
@@ -75,7 +77,7 @@ def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Opti
     gaussians.version += 1
 
 
-def resize(root: nn.Module, gaussians: GaussianField, count: int) -> None:
+def resize_gaussians(root: nn.Module, gaussians: GaussianField, count: int) -> None:
     """Give every per-Gaussian tensor `count` rows of zeros, so that a state dict of that size fits."""
     for name, old in row_parameters(root, len(gaussians)).items():
         _set(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad))

@@ -75,7 +75,7 @@ class FrozenArray:
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
         moving, encoding = model.site.moving(tx, rx), model.emission.encoding
         # The compiled kernel is float32; float64, for slopes, goes the long way below.
-        kernels = moving.dtype == torch.float32 and queries.served(moving, self.weights)
+        kernels = moving.dtype == torch.float32 and queries.has_query_kernel(moving, self.weights)
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
                 moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
@@ -93,22 +93,22 @@ class FrozenArray:
 
 
 @torch.no_grad()
-def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
+def freeze_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     """Freeze what a static receiver sees of a model of spectra."""
     version = int(model.gaussians.version)
     if isinstance(model.response, ArrayResponse):
-        return frozen_array(model, seen_by_array(model, rx))
+        return freeze_array(model, gaussian_vectors(model, rx))
     plan = model.freeze(rx)
     return FrozenView(version, plan, _subset(plan.order, model))
 
 
 @torch.no_grad()
-def frozen_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None) -> FrozenArray:
+def freeze_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None) -> FrozenArray:
     """Freeze a model with an array from what the array measures of each Gaussian, `view` (N, M).
 
     Args:
         model: the field as it is now.
-        view: of `seen_by_array`.
+        view: of `gaussian_vectors`.
         renderer: None takes the response's own.
     """
     emission, response, version = model.emission, model.response, int(model.gaussians.version)
@@ -134,11 +134,11 @@ def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
     copy = deepcopy(model)
     # Kept rows stay in their order: all are appended anew in the plan's instead.
     none = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
-    edit.apply(edit.Edit(none, rows), copy, copy.gaussians)
+    edit.apply_edit(edit.Edit(none, rows), copy, copy.gaussians)
     return copy
 
 
-def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
+def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
     """Return A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
 
     Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that antenna by

@@ -94,7 +94,7 @@ class GaussianField(nn.Module):
         return torch.sigmoid(self.opacity_logits)
 
 
-def initial_field(
+def create_field(
     settings: FieldSettings,
     box: Tensor,
     receiver: Tensor | None,

@@ -20,12 +20,12 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
 from gsparc.data import heeded
-from gsparc.data.datamodule import Loaded
+from gsparc.data.datamodule import DataModule, Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.distributed import SummedGradients
 from gsparc.field.module import NetworkModule
-from gsparc.field.stage_budget import SPENT, Budget
+from gsparc.field.stage_budget import SPENT, StageBudget
 from gsparc.training.context import FitContext
 from gsparc.training.time_budget import Spent, TimeBudget
 
@@ -49,23 +49,21 @@ DEFAULTS = partial(
 
 
 @dataclass(frozen=True)
-class Ran:
-    """What a stage took.
+class TrainerResult:
+    """Steps of a training that has ended.
 
     Attributes:
-        seconds: that it took, validations too [s].
         kept: steps whose result is kept; None where the schedule was gone through to its end.
         taken: steps in all.
         timed_out: whether `trainer.max_time` ended it.
     """
 
-    seconds: float
     kept: int | None
     taken: int
-    timed_out: bool = False
+    timed_out: bool
 
 
-def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> int | None:
+def requested_steps(context: FitContext, rows: int, own: int | None = None) -> int | None:
     """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
 
     Args:
@@ -90,7 +88,7 @@ def steps_asked_for(context: FitContext, rows: int, own: int | None = None) -> i
     return min(one for one in (steps, of_epochs) if one is not None)
 
 
-class ReturnMetrics(L.Callback):
+class ReportSteps(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
@@ -100,7 +98,7 @@ class ReturnMetrics(L.Callback):
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
 
 
-def stands(trainer: L.Trainer) -> bool:
+def step_is_complete(trainer: L.Trainer) -> bool:
     """Whether a step is done with, at the end of its batch or of its look at validation rows.
 
     Lightning leaves out a look that follows, where a run goes on from a state before it.
@@ -136,7 +134,7 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
-        if self.requested and stands(trainer):
+        if self.requested and step_is_complete(trainer):
             trainer.save_checkpoint(self.file)
             raise _Stopped
 
@@ -165,11 +163,13 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
             signal.signal(signal.SIGINT, before)
 
 
-def run_stage(
+def make_trainer(
     module: NetworkModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
     budget: TimeBudget, watch: Sequence[L.Callback] = (),
-) -> Ran:  # fmt: skip
-    """Train `module` on `fold.train`, watching `fold.val`.
+) -> tuple[L.Trainer, DataModule]:  # fmt: skip
+    """Return the Trainer that trains `module` on `fold.train`, watching `fold.val`, and its data.
+
+    `with interruptible(trainer, batches): trainer.fit(module, datamodule=batches, ...)` trains it.
 
     Args:
         module: what is trained.
@@ -179,18 +179,20 @@ def run_stage(
         watch: callbacks that say which steps are kept.
 
     Raises:
-        KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
+        ValueError: several devices that do not train one model.
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
-    before = budget.counted
-    budget.pause()
-    budget.go()  # what other processes go on from
+    budget.restart()
     if batches is None or batches.measurements is not data:
         batches = Loaded(data, context.batch_size)
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks = [Budget(budget), *watch, *_told(context.callbacks(), len(fold.val), module.count is not None)]
+    callbacks = [
+        StageBudget(budget),
+        *watch,
+        *_told(context.callbacks(), len(fold.val), module.count is not None),
+    ]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -220,7 +222,7 @@ def run_stage(
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
-        callbacks=[*callbacks, ReturnMetrics(), stop],
+        callbacks=[*callbacks, ReportSteps(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
@@ -230,9 +232,21 @@ def run_stage(
         heeded.count("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
+    return trainer, batches
+
+
+@contextmanager
+def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
+    """Let an interrupt of `trainer.fit` wait for a checkpoint, and say from what to go on.
+
+    Raises:
+        KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
+        RuntimeError: one of several processes was lost.
+    """
+    stop = next(one for one in trainer.callbacks if isinstance(one, StopBetweenSteps))  # type: ignore[attr-defined]
     try:
         with stop.handling_interrupts():
-            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
+            yield
     except (_Stopped, SystemExit, ProcessException) as ended:
         # Lightning's answer to a KeyboardInterrupt is SystemExit.
         advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
@@ -241,16 +255,20 @@ def run_stage(
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     finally:
         batches.trainer = None  # which holds the optimizer's state
+
+
+def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult:
+    """Return the steps of a Trainer that has ended, and charge what it spent elsewhere to the budget."""
     metrics = trainer.callback_metrics
     more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
     budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
     kept = int(metrics[KEPT]) if KEPT in metrics else None
     taken = int(metrics[TAKEN])
-    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[union-attr]
+    timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
     timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
     if timed_out:
-        log.warning("trainer.max_time ended training after %d of %d steps", taken, module.total_steps)
-    return Ran((budget.counted - before).wall, kept, taken, timed_out)
+        log.warning("trainer.max_time ended training after %d of %d steps", taken, trainer.max_steps)
+    return TrainerResult(kept, taken, timed_out)
 
 
 def _told(callbacks: Sequence[L.Callback], rows: int, edits: bool) -> Sequence[L.Callback]:

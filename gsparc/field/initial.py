@@ -84,7 +84,7 @@ class InitTask:
         return self.settings.emission.encoding.anchors
 
 
-def unchanged(model: GaussianModel) -> None:
+def keep_weights(model: GaussianModel) -> None:
     """Leave random weights as they are."""
 
 
@@ -101,7 +101,7 @@ class Start:
     """
 
     prior: Prior | None
-    solve: Callable[[GaussianModel], Any] = unchanged
+    solve: Callable[[GaussianModel], Any] = keep_weights
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
     left_out: Any = None

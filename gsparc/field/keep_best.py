@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.field import edit
-from gsparc.field.distributed import agreed
+from gsparc.field.distributed import first_process_value
 from gsparc.field.gradient_stage import KEPT
 from gsparc.field.module import GaussianModule
 
@@ -47,10 +47,10 @@ class KeepBest(L.Callback):
         """Keep what is better; the look before the first step is Lightning's sanity check."""
         if trainer.state.fn != "fit" or not len(module.held_out):
             return
-        error = agreed(float(module.held_out.mean()), trainer)
+        error = first_process_value(float(module.held_out.mean()), trainer)
         if trainer.sanity_checking:
             self.start = module.held_out
-        surely = agreed(float(_surely_less(module.held_out, self.start)), trainer)
+        surely = first_process_value(float(_surely_less(module.held_out, self.start)), trainer)
         if trainer.sanity_checking or (error < self.error and surely):
             self.error, self.step = error, trainer.global_step
             self._kept = copy.deepcopy(module.model.state_dict())
@@ -68,7 +68,7 @@ class KeepBest(L.Callback):
         if self.step == taken:
             return
         model = module.model
-        edit.resize(model, model.gaussians, len(self._kept["gaussians.ids"]))
+        edit.resize_gaussians(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         log.info(
             "gradient steps: %d taken, %s kept: later ones not significantly better on %d rows held out",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.data.query import Batch
 from gsparc.field.initial import Snapshot
-from gsparc.ops.similarity import served, similarity_op
+from gsparc.ops.similarity import has_similarity_kernel, similarity_op
 from gsparc.ops.transforms import carries_tangent
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
@@ -75,7 +75,7 @@ def _window(images: Tensor) -> Tensor:
     return images
 
 
-def holds_window(images: Tensor | np.ndarray) -> bool:
+def fits_ssim_window(images: Tensor | np.ndarray) -> bool:
     """Whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
     return min(images.shape[-2:]) > 2 * WINDOW_RADIUS
 
@@ -93,9 +93,9 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         ValueError: an image smaller than the window.
         RuntimeError: a second derivative in float32 outside `torch.func`.
     """
-    if not holds_window(prediction):
+    if not fits_ssim_window(prediction):
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
-    kernel = prediction.dtype == target.dtype and served(prediction)
+    kernel = prediction.dtype == target.dtype and has_similarity_kernel(prediction)
     kernel = kernel and not target.requires_grad and not carries_tangent(target)  # it knows one slope
     return (_Kernel.apply if kernel else _written_out)(prediction, target)
 
@@ -106,12 +106,12 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     L1 alone for images smaller than SSIM's window, which have no SSIM.
     """
     absolute = (prediction - target).abs().mean(dim=(-2, -1))
-    if ssim_weight == 0 or not holds_window(prediction):
+    if ssim_weight == 0 or not fits_ssim_window(prediction):
         return absolute
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
 
 
-class LossOf(Protocol):
+class LossOptions(Protocol):
     """What `task_loss` reads, each where targets call for it.
 
     Attributes:
@@ -128,7 +128,7 @@ class LossOf(Protocol):
         """Unknown offset of each row of channels."""
 
 
-def task_loss(prediction: Tensor, batch: Batch, settings: LossOf) -> Tensor:
+def task_loss(prediction: Tensor, batch: Batch, settings: LossOptions) -> Tensor:
     """Return the loss (B,) of spectra, channels or powers; what was not measured counts as met.
 
     Args:

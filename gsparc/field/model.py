@@ -16,7 +16,7 @@ from gsparc.data.schema import Site
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
-from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
+from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
 
@@ -123,7 +123,7 @@ class GaussianModel(nn.Module):
         self.settings = settings
         self.site = site
         box, query_box = torch.as_tensor(site.box).float(), torch.as_tensor(site.query_box)
-        self.gaussians: GaussianField = initial_field(
+        self.gaussians: GaussianField = create_field(
             settings.field,
             box,
             None if receiver is None else receiver.position,

@@ -16,10 +16,10 @@ from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
 from gsparc.data.schema import Site
 from gsparc.field import edit
-from gsparc.field.confidence import weighted
-from gsparc.field.distributed import count
+from gsparc.field.confidence import confidence_weighted_loss
+from gsparc.field.distributed import process_count
 from gsparc.field.initial import Snapshot
-from gsparc.field.losses import holds_window, ssim, task_loss
+from gsparc.field.losses import fits_ssim_window, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
 from gsparc.ops import UnsoundGaussian
@@ -95,7 +95,7 @@ class NetworkModule(L.LightningModule):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         if (self.global_step + 1) % self.log_every == 0:
-            part = batch.share * count()  # the mean over processes is that over the batch
+            part = batch.share * process_count()  # the mean over processes is that over the batch
             self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
             # weighted by the confidence, where there is one
             self.log("train/loss", loss.detach() * part, sync_dist=True)
@@ -121,7 +121,7 @@ class NetworkModule(L.LightningModule):
         if self.site.kind != "spectrum":
             figures["val/mse"] = error.mean()
         else:
-            if holds_window(mean):
+            if fits_ssim_window(mean):
                 figures["val/ssim_gauss"] = ssim(mean, batch.target).mean()
             figures["val/psnr_db"] = (-10 * error.clamp_min(1e-12).log10()).mean()
         self._looks.append((errors, figures))
@@ -155,7 +155,7 @@ class NetworkModule(L.LightningModule):
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
         """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
         raise NotImplementedError(
-            "a checkpoint holds a whole model: say gsparc.models.loading.module_of(FILE)"
+            "a checkpoint holds a whole model: say gsparc.models.loading.load_module(FILE)"
         )
 
     def configure_optimizers(self) -> Any:
@@ -228,7 +228,7 @@ class GaussianModule(NetworkModule):
         if confidence is None:
             return task.mean(), task
         exponent = confidence.exponent(self.site.moving(batch.tx, batch.rx))
-        return weighted(task, exponent, confidence.settings.alpha).mean(), task
+        return confidence_weighted_loss(task, exponent, confidence.settings.alpha).mean(), task
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
@@ -243,7 +243,7 @@ class GaussianModule(NetworkModule):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
         """Make room for the number of Gaussians before their tensors arrive."""
-        edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        edit.resize_gaussians(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
         return super().load_state_dict(state_dict, *rest, **named)
 
     def _offender(self) -> str | None:

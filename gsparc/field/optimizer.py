@@ -55,7 +55,7 @@ class OptimizerSettings(Checked):
 
     def rate_of(self, name: str) -> tuple[str, float]:
         """Return a parameter's kind and initial rate by dotted name; `KeyError` where none is declared."""
-        kind = kind_of(name)
+        kind = rate_kind(name)
         return kind, getattr(self, kind)
 
 
@@ -71,7 +71,7 @@ KINDS = {
 }
 
 
-def kind_of(name: str) -> str:
+def rate_kind(name: str) -> str:
     """Return which rate a parameter follows, by dotted name; `KeyError` where none is declared."""
     for prefix, kind in KINDS.items():
         if name == prefix or name.startswith(prefix + "."):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.data.query import Batch
 from gsparc.field import edit
-from gsparc.field.frozen import seen_by_array
+from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import Pose
@@ -20,7 +20,7 @@ RIDGE = 1e-3  # of the mean energy of a view: footprints overlap, and less lets 
 
 
 @dataclass(frozen=True)
-class Solved:
+class SolvedReadout:
     """The read-out of a field after an edit.
 
     Attributes:
@@ -34,7 +34,7 @@ class Solved:
 
 
 @torch.no_grad()
-def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solved | None:
+def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> SolvedReadout | None:
     """Return the read-out with which an edited field renders what it does now; the field stays as it is.
 
     Weights of the edited field are corrected by least squares, for all features at once.
@@ -52,7 +52,7 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
         return None
     rendered = _lines(model) @ _view(model, batch.rx)
     trial = copy.deepcopy(model)
-    edit.apply(change, trial, trial.gaussians)
+    edit.apply_edit(change, trial, trial.gaussians)
     view = _view(trial, batch.rx)
     # float64: eigenvalues of footprints that overlap are lost in float32's rounding.
     gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
@@ -63,7 +63,7 @@ def solved_again(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solve
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
     trial.emission.bias2.add_(correction[-1])
     error = trial(batch.tx, batch.rx).mean - model(batch.tx, batch.rx).mean
-    return Solved(trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean())
+    return SolvedReadout(trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean())
 
 
 def _lines(model: GaussianModel) -> Tensor:
@@ -79,7 +79,7 @@ def _view(model: GaussianModel, rx: Pose) -> Tensor:
     it is split into.
     """
     if isinstance(model.response, ArrayResponse):
-        view = seen_by_array(model, rx)
+        view = gaussian_vectors(model, rx)
     else:
         each = torch.eye(len(model.gaussians), device=model.gaussians.means.device)
         view = model.freeze(rx).render(each, int(model.gaussians.version)).flatten(1)

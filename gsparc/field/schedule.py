@@ -16,12 +16,12 @@ INTERVAL = Limit(
 )
 
 
-def in_steps(given: int | float, total: int) -> int:
+def to_steps(given: int | float, total: int) -> int:
     """Return the step that `given` means in a training of `total` steps; a share is of one step at least."""
     return given if isinstance(given, int) else max(1, round(given * total))
 
 
-def due(step: int, start: int | float, stop: int | float, interval: int | float, total: int) -> bool:
+def acts_at_step(step: int, start: int | float, stop: int | float, interval: int | float, total: int) -> bool:
     """Whether a callback acts at a step: on a multiple of `interval` from `start` to `stop`.
 
     Where the interval is a share, not before `FIRST` steps were taken: a training that short has gradients of
@@ -32,7 +32,7 @@ def due(step: int, start: int | float, stop: int | float, interval: int | float,
         start, stop, interval: steps, or shares.
         total: steps of the schedule.
     """
-    first, last, apart = (in_steps(value, total) for value in (start, stop, interval))
+    first, last, apart = (to_steps(value, total) for value in (start, stop, interval))
     if isinstance(interval, float) and step < FIRST:
         return False
     return first <= step <= last and step % apart == 0

@@ -9,13 +9,13 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.field.distributed import agreed
+from gsparc.field.distributed import first_process_value
 from gsparc.training.time_budget import NOTHING, Spent, TimeBudget
 
 SPENT = "time/spent_s"  # metric of both clocks
 
 
-class Budget(L.Callback):
+class StageBudget(L.Callback):
     """Counts the seconds of a stage, validations too, and ends it when they are over.
 
     Args:
@@ -31,7 +31,7 @@ class Budget(L.Callback):
         return self.budget.counted - self._begin
 
     def _look(self, trainer: L.Trainer) -> None:
-        if agreed(float(self.budget.over()), trainer):
+        if first_process_value(float(self.budget.over()), trainer):
             trainer.should_stop = True
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:

@@ -25,6 +25,7 @@ from scipy.spatial.distance import cdist
 from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.target_rows import TINY_POWER
 from gsparc.physics.row_factors import Freedom, alignment_factors, freedom_words
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel
@@ -60,7 +61,7 @@ class Alignment:
     phase_reference: Literal["carrier", "neighbours"]
 
 
-def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
+def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     """Return measurements with training and validation rows turned to each other, and rows to learn from.
 
     Several packets of one place and station become one, the first of them, whose channel is their mean. Rows
@@ -76,12 +77,12 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
     for rows in _parts(data, known):
-        best, own = align(rows, site.freedom, site), target[rows.rows]
+        best, own = align_rows(rows, site.freedom, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
             # Where gains are free rows have no level of their own: all are learned at unit power.
-            level = np.maximum(_rms(rows.values), 1e-30)[rows.moment]
+            level = _rms(rows.values)[rows.moment]
             factors = factors / level[:, None, None]
             if noise is not None:
                 noise = np.array(noise)
@@ -98,14 +99,14 @@ def with_common_phase(data: Measurements, fold: Fold) -> tuple[Measurements, Fol
     turned = replace(
         data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
     )
-    train, turned = averaged(turned, fold.train)
-    val, turned = averaged(turned, fold.val)
+    train, turned = average_packets(turned, fold.train)
+    val, turned = average_packets(turned, fold.val)
     result = turned, Fold(train, val, fold.test)
     _LAST[:] = [(weakref.ref(data), key, result)]
     return result
 
 
-def averaged(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
+def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
     """Return the first of `rows` at each place and station, and measurements where these are the means."""
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
     packets, seen = np.c_[data.moving[rows], station], None if data.mask is None else data.mask[rows]
@@ -133,16 +134,16 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Root mean square (n,) of what was measured in rows (n, A, K)."""
+    """Root mean square (n,) of what was measured in rows (n, A, K), above 0."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
-    return np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count)
+    return np.maximum(np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count), TINY_POWER)
 
 
 # Of the last alignment the measurements, what else it depends on, and its result: baselines share it.
 _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measurements, Fold]]] = []
 
 
-def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
+def align_rows(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     if len(rows.values) == 1:  # a row alone has no other to be turned to
         return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")
@@ -150,7 +151,7 @@ def align(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
-        values = values / np.maximum(_rms(values), 1e-30)[:, None, None]
+        values = values / _rms(values)[:, None, None]
     length = site.wavelength or SPACINGS * spacing(rows.places)
     one = _Rows(rows.places, values, rows.tones, freedom, length)
     found = [one.smooth(one.along_tree(None))]

@@ -90,14 +90,15 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     if site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
     content = {
-        "format": FORMAT, "version": VERSION, "method": method.name, "target": import_path(method.stored_as),
-        "config": config, "site": _plain(asdict(site), "site"), "state": _plain(method.state(), "state"),
+        "format": FORMAT, "version": VERSION, "config": config,
+        "method": method.name, "target": import_path(method.stored_class),
+        "site": _plain(asdict(site), "site"), "state": _plain(method.state(), "state"),
         "extra": _plain(dict(extra or {}), "extra"),
     }  # fmt: skip
     _write(Path(path), content)
 
 
-def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
+def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     """Add to (or replace in) the `extra` of a checkpoint; everything else in the file stays as it is.
 
     Raises:
@@ -168,7 +169,7 @@ def _content(path: Path) -> dict[str, Any]:
     if _overgrown(content):  # what walks over it would not end
         raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
     for part in ("site", "state"):
-        where = non_finite(_without_unknown_places(content.get(part)), part)
+        where = find_non_finite(_without_unknown_places(content.get(part)), part)
         if where is not None:  # its checksum is right: it was written like this
             raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
     return content
@@ -238,7 +239,7 @@ def _overgrown(content: Any) -> bool:
     return False
 
 
-def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
+def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
     """Return where the first NaN is, or infinity unless it may be `infinite`; None: all are finite."""
     if isinstance(value, Tensor):
         wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
@@ -250,7 +251,7 @@ def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
         parts = ((f"{where}.{key}", one) for key, one in value.items())
     elif isinstance(value, (list, tuple)):
         parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
-    each = (non_finite(one, name, infinite=infinite) for name, one in parts)
+    each = (find_non_finite(one, name, infinite=infinite) for name, one in parts)
     return next((result for result in each if result is not None), None)
 
 

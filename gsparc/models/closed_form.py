@@ -8,8 +8,8 @@ covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 from torch import Tensor
@@ -19,6 +19,8 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, import_path
 from gsparc.training.context import FitContext
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -78,13 +80,13 @@ class ClosedForm(Method):
         yield 1.0, self
 
 
-def stored(method: Method) -> dict[str, Any]:
-    """Return what `restored` reads."""
-    return {"target": import_path(method.stored_as), "state": method.state()}
+def method_state(method: Method) -> dict[str, Any]:
+    """Return what `method_from_state` reads."""
+    return {"target": import_path(method.stored_class), "state": method.state()}
 
 
-def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
-    """Return the method whose `stored` state this was.
+def method_from_state(site: Site, state: dict[str, Any]) -> ClosedForm:
+    """Return the method whose `method_state` state this was.
 
     Raises:
         ValueError: it names what is no such method of gsparc or a plugin.
@@ -97,3 +99,35 @@ def restored(site: Site, state: dict[str, Any]) -> ClosedForm:
     method = kind()
     method.restore(site, state["state"])
     return method
+
+
+def to_containers(part: Any) -> Any:
+    """Return a dict of a dataclass by its fields' names, lists of tuples, and all else as it is.
+
+    >>> from gsparc.training.time_budget import Spent
+    >>> to_containers(Spent(wall=2.0))
+    {'wall': 2.0, 'processor': 0.0}
+    """
+    if is_dataclass(part):
+        return {each.name: to_containers(getattr(part, each.name)) for each in fields(part)}
+    return [to_containers(each) for each in part] if isinstance(part, tuple) else part
+
+
+def from_containers(kind: type[T], stored: dict[str, Any]) -> T:
+    """Return the dataclass of this kind whose `to_containers` was stored; lists become tuples.
+
+    >>> from gsparc.training.time_budget import Spent
+    >>> from_containers(Spent, {"wall": 2.0, "processor": 0.5})
+    Spent(wall=2.0, processor=0.5)
+
+    Raises:
+        TypeError: a field without a default is missing, or there is one that the kind does not have.
+    """
+    hints = get_type_hints(kind)
+    return kind(**{name: _from_container(hints.get(name), value) for name, value in stored.items()})
+
+
+def _from_container(hint: Any, value: Any) -> Any:
+    if isinstance(hint, type) and is_dataclass(hint):
+        return from_containers(hint, value)
+    return tuple(_from_container(None, each) for each in value) if isinstance(value, list) else value

@@ -22,7 +22,7 @@ from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
-from gsparc.models.aligned_rows import with_common_phase
+from gsparc.models.aligned_rows import align_phases
 from gsparc.models.checkpoint import Stored
 from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
@@ -51,7 +51,7 @@ _HASHED = (
 )
 
 
-def fit(
+def fit_or_resume(
     factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext
 ) -> tuple[Method, FitReport]:
     """Make the method of these measurements and fit it, go on with it, or take what was finished.
@@ -67,7 +67,7 @@ def fit(
     """
     budget = TimeBudget()
     # Before the method is made, as another may be called for once rows share a phase.
-    (data, rows), left = with_common_phase(data, fold), context.resume
+    (data, rows), left = align_phases(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count("*")
@@ -78,7 +78,7 @@ def fit(
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
-    method = factory.made_for(data)
+    method = factory.create_for(data)
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
@@ -89,14 +89,16 @@ def fit(
     return method, report
 
 
-def marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
+def checkpoint_marks(
+    report: FitReport, data: Measurements, fold: Fold, context: FitContext
+) -> dict[str, Any]:
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.of(data, fold, context).marks()}
 
 
-def folder_of(path: Path, parts: str) -> Path:
+def run_folder(path: Path, parts: str) -> Path:
     """Return the folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
     inside = path if path.is_dir() else path.parent
     if any(re.fullmatch(parts, one.name) for one in inside.glob("*")):
@@ -108,8 +110,8 @@ def _restored(
     factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext, file: Path
 ) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
-    Origin.of(data, fold, context).refuse_other(stored)
-    method, extra = factory.made_as(stored.target), stored.extra
+    Origin.of(data, fold, context).require_same(stored)
+    method, extra = factory.create_as(stored.target), stored.extra
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))
@@ -158,7 +160,7 @@ class Origin:
     def _hashes(self) -> dict[str, str]:
         return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
 
-    def refuse_other(self, stored: Stored) -> None:
+    def require_same(self, stored: Stored) -> None:
         """Whether training may go on from `stored`; settings of its schedule that changed are logged.
 
         Raises:
@@ -192,17 +194,17 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
     """`key=value (here other)` for every setting under `keys` that differs; none without a configuration."""
     if not before or not now:
         return []
-    one, two = dict(leaves(before)), dict(leaves(now))
+    one, two = dict(dotted_settings(before)), dict(dotted_settings(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
     # `model.refit` lies under `model`, and may change all the same.
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 
 
-def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def dotted_settings(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield settings by dotted name."""
     for key, value in node.items():
         if isinstance(value, Mapping):
-            yield from leaves(value, f"{prefix}{key}.")
+            yield from dotted_settings(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

@@ -11,13 +11,13 @@ import numpy as np
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Measurements
-from gsparc.models.each_or_together import LearnsTogether
 from gsparc.models.method import Method, import_path
+from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
 from gsparc.models.refined_places import errors_of
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
-from gsparc.models.terms import EffectSettings, called_for
+from gsparc.models.terms import EffectSettings, resolve_terms
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
     with heeded.apart():  # what decides is counted below; the method may heed more
         switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
         count, falls = model.field.count, model.attenuation.inverse_distance
-        terms = called_for(switches, init, data, model.emission.hidden, count, falls)
+        terms = resolve_terms(switches, init, data, model.emission.hidden, count, falls)
         plain, hides = switches.residual is not False, switches.visibility
         # No Gaussians means the residual alone, where that is not switched off.
         placed = count > 0 or not plain
@@ -63,7 +63,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         if kind is Channels and site.phase_reference != "neighbours":
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
             reasons.append(f"the residual is all there is: {why}")
-        method = settings.made_as(import_path(kind))
+        method = settings.create_as(import_path(kind))
         if rendered:
             options += ["init.name"] * (init.name in ("auto", "diffuse"))
     heeded.count(*options)
@@ -98,7 +98,7 @@ class Gsparc(LearnsTogether):
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
 
-    def made_for(self, data: Measurements) -> Method:
+    def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`; the log says what was chosen."""
         method = choose(data, self)
         if isinstance(method, ImageProcess):
@@ -107,7 +107,7 @@ class Gsparc(LearnsTogether):
         method.name = self.name
         return method
 
-    def made_as(self, target: str) -> Method:
+    def create_as(self, target: str) -> Method:
         """See `MethodFactory`; under its own name."""
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:

@@ -11,11 +11,11 @@ from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
-from gsparc.models.registry import build, known
+from gsparc.models.registry import all_methods, build
 from gsparc.models.splat.method import LearnedField
 
 
-def restore(stored: checkpoint.Stored) -> Method:
+def method_from_checkpoint(stored: checkpoint.Stored) -> Method:
     """Return the fitted method a checkpoint holds; only classes of gsparc are built.
 
     Raises:
@@ -27,13 +27,13 @@ def restore(stored: checkpoint.Stored) -> Method:
         makers = stored.target, import_path(Gsparc)
         if isinstance(model, dict) and model.get("_target_") in makers:
             factory = build(model, trusted=False)
-        elif stored.target in known().values():
+        elif stored.target in all_methods().values():
             factory = get_class(stored.target)()
         else:
             raise checkpoint.CheckpointError(
                 f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
             )
-        return made_again(factory, stored)
+        return rebuild_method(factory, stored)
     except checkpoint.CheckpointError:
         raise
     except Exception as error:  # the state comes from a file: anything may be wrong with it
@@ -43,10 +43,10 @@ def restore(stored: checkpoint.Stored) -> Method:
         ) from error
 
 
-def made_again(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
+def rebuild_method(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
     """Return what `factory` makes of the stored class, or one for each station, with a stored state."""
     several = "per_station" in stored.state
-    method = PerStation(factory) if several else factory.made_as(stored.target)
+    method = PerStation(factory) if several else factory.create_as(stored.target)
     method.restore(stored.site, stored.state)
     method.name = stored.method
     return method
@@ -59,10 +59,10 @@ def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
         CheckpointError: as these two.
     """
     stored = checkpoint.read(path)
-    return restore(stored), stored
+    return method_from_checkpoint(stored), stored
 
 
-def module_of(path: str | Path) -> GaussianModule:
+def load_module(path: str | Path) -> GaussianModule:
     """Return the LightningModule in a `model.ckpt` or `last.ckpt` of a splatted field, on the CPU.
 
     Raises:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import pickle
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,6 +25,9 @@ from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
     from gsparc.processes.powers import PowerProcess
+
+T = TypeVar("T")
+DOUBLE = {torch.float32: torch.float64, torch.complex64: torch.complex128}
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class MethodFactory(ABC):
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
 
     @abstractmethod
-    def made_for(self, data: Measurements) -> Method:
+    def create_for(self, data: Measurements) -> Method:
         """Return an unfitted method for measurements; their targets are not looked at.
 
         Raises:
@@ -86,7 +91,7 @@ class MethodFactory(ABC):
         """
 
     @abstractmethod
-    def made_as(self, target: str) -> Method:
+    def create_as(self, target: str) -> Method:
         """Return an unfitted method of the class that a checkpoint names, with these settings.
 
         Raises:
@@ -97,7 +102,7 @@ class MethodFactory(ABC):
         """Whether it learns several stations of this site at once, told which by `Query.station`."""
         return False
 
-    def best_stations(
+    def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
         """Return how several stations are best learned, and why, one line; "" if nothing was to decide."""
@@ -119,13 +124,13 @@ class Method(MethodFactory):
         False  # whether several threads answer a single place sooner than one: where it renders
     )
 
-    def made_for(self, data: Measurements) -> Method:
+    def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`."""
         return deepcopy(self)
 
-    def made_as(self, target: str) -> Method:
+    def create_as(self, target: str) -> Method:
         """See `MethodFactory`."""
-        if target != import_path(self.stored_as):
+        if target != import_path(self.stored_class):
             raise ValueError(f"model={self.name} makes no {target}: train again")
         return deepcopy(self)
 
@@ -139,12 +144,12 @@ class Method(MethodFactory):
         """What was fitted, in words: under one name a method may be one thing here and another there."""
         return self.label
 
-    def field_alone(self) -> Method | None:
+    def without_process(self) -> Method | None:
         """Return its Gaussians without the process that they are mixed with; None where nothing is mixed."""
         return None
 
     @property
-    def stored_as(self) -> type[MethodFactory]:
+    def stored_class(self) -> type[MethodFactory]:
         """The class that a checkpoint names."""
         return type(self)
 
@@ -185,13 +190,13 @@ class Method(MethodFactory):
         """The part of it that answers faster and less accurately when asked to; None: it does so itself."""
         return None
 
-    def knobs(self) -> tuple[str, ...]:
+    def reduction_settings(self) -> tuple[str, ...]:
         """Return names of the settings of `reduced` that mean something to what was fitted; here none."""
-        return () if self.reducible is None else self.reducible.knobs()
+        return () if self.reducible is None else self.reducible.reduction_settings()
 
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    def reduction_inputs(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return what must be known of training rows (n,) to reduce it; stored with the model."""
-        return {} if self.reducible is None else self.reducible.contributions(data, rows)
+        return {} if self.reducible is None else self.reducible.reduction_inputs(data, rows)
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """Return a method that answers with these settings; this one is left as it is."""
@@ -216,7 +221,7 @@ class Method(MethodFactory):
         }
 
 
-def predictions(
+def predict_in_batches(
     method: Method, data: Measurements, rows: np.ndarray, size: int = 64
 ) -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
     """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
@@ -246,8 +251,36 @@ def predictions(
         yield chosen, batch, replace(said, mean=said.mean * factor, variance=variance)
 
 
+def to_double(part: T) -> T:
+    """Return a copy of anything that pickles, its tensors constants in float64 or complex128.
+
+    What is of these types already, and arrays of NumPy, are shared and not copied.
+    """
+    tensors: dict[int, Any] = {}  # alive as long as their numbers are asked for
+
+    class Parts(pickle.Pickler):
+        def persistent_id(self, value: Any) -> int | None:
+            if not isinstance(value, Tensor | np.ndarray):
+                return None
+            tensors[id(value)] = value
+            return id(value)
+
+    class Doubled(pickle.Unpickler):
+        def persistent_load(self, number: int) -> Any:
+            value = tensors[number]
+            if isinstance(value, Tensor):
+                tensors[number] = value = value.detach().to(DOUBLE.get(value.dtype, value.dtype))
+            return value
+
+    whole = io.BytesIO()
+    Parts(whole, pickle.HIGHEST_PROTOCOL).dump(part)
+    whole.seek(0)
+    result: T = Doubled(whole).load()
+    return result
+
+
 @contextmanager
-def suited_threads(method: Method, places: int) -> Iterator[None]:
+def suitable_threads(method: Method, places: int) -> Iterator[None]:
     """Run with as many CPU threads as suit a query: one for a single place, whose parts are small.
 
     On a busy machine two threads that wait for each other take up to a hundred times as long.
@@ -263,9 +296,9 @@ def suited_threads(method: Method, places: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def answered(method: Method, query: Query) -> Prediction:
+def predict_with_threads(method: Method, query: Query) -> Prediction:
     """Return what a method predicts, by as many threads as suit the query."""
-    with suited_threads(method, len(query)):
+    with suitable_threads(method, len(query)):
         return method.predict(query)
 
 

@@ -21,17 +21,18 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
+from gsparc.data.errors import some
 from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
-from gsparc.models.closed_form import stored
+from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.reduced import View
-from gsparc.models.target_rows import heard
+from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.time_budget import Spent, less_repeatable
@@ -42,7 +43,7 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that statio
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
-def for_stations(factory: MethodFactory, data: Measurements) -> MethodFactory:
+def by_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
     """Return what makes a method of all stations where there are several, else `factory` itself.
 
     Raises:
@@ -60,12 +61,12 @@ def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> t
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
-    rows = fold.train if method.uses_censored else heard(data, fold.train)
+    rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
     known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
     return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
 
 
-def of_station(site: Site, number: int) -> Site:
+def station_site(site: Site, number: int) -> Site:
     """Return the site as one station sees it; of `UNHEARD`, with both ends moving.
 
     Its hash is its own, so that nothing kept of one station is taken for another's.
@@ -100,7 +101,7 @@ class PerStation(Method):
         self._shared = False  # whether one copy knows all stations
 
     @property
-    def stored_as(self) -> type[MethodFactory]:
+    def stored_class(self) -> type[MethodFactory]:
         """What makes the copies, of which each names its own class."""
         return type(self.factory)
 
@@ -128,7 +129,7 @@ class PerStation(Method):
         budget = context.time_budget()
         numbers = self._numbers(data, fold, context)
         self.site, notes = data.site, []
-        left = None if context.resume is None else fitting.folder_of(context.resume, fitting.STATIONS)
+        left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
@@ -151,7 +152,7 @@ class PerStation(Method):
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before = budget.counted.wall
             try:
-                copy, report = fitting.fit(self.factory, part, inner, own)
+                copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
                 # A single station's own message already names the file to go on from.
                 if not resumable or len(numbers) == 1:
@@ -159,7 +160,7 @@ class PerStation(Method):
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = fitting.marks(report, part, inner, own)
+                extra = fitting.checkpoint_marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
@@ -188,21 +189,20 @@ class PerStation(Method):
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
             with heeded.apart():
-                how, why = self.factory.best_stations(data, fold, context)
+                how, why = self.factory.choose_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.factory.shares(data.site)
         self._shared = together and joint
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         known, unheard = trained_stations(self.factory, data, fold)
+        names = some([stations.name[t] for t in np.flatnonzero(unheard)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
             if not self.factory.both_ends and not joint:
-                names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
         if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
-            names = ", ".join(stations.name[t] for t in np.flatnonzero(unheard)[:3])
             needs = f"{self.name}: places of stations are unknown, it needs them"
             if together:
                 raise ValueError(f"{needs}; say stations=each")
@@ -267,23 +267,22 @@ class PerStation(Method):
             assert self.site is not None and self.site.stations is not None
             name = self.site.stations.name[number]
             raise ValueError(f"{self.name}: station {name} had too few training rows")
-        return OfStation(copy, number) if self._shared else copy
+        return OneStationView(copy, number) if self._shared else copy
 
-    def every(self) -> OfStations | None:
+    def every(self) -> AllStationsView | None:
         """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
-        return OfStations(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
+        return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
-        return site if number == UNHEARD and self.factory.shares(site) else of_station(site, number)
+        return site if number == UNHEARD and self.factory.shares(site) else station_site(site, number)
 
     def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
         # One pose may stand for all rows.
-        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3)
-        ends = query.tx if self.site.static_end == "tx" else receiver
+        ends = query.tx if self.site.static_end == "tx" else query.rx.position.expand_as(query.tx)
         table = torch.from_numpy(self.site.stations.position)
         # A station at an unknown place is nearest to none: NaN would be the least of every row.
         distance = torch.cdist(ends.detach().cpu().double(), table).nan_to_num(math.inf)
@@ -295,19 +294,19 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())
-            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
+            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}")
         return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
 
     def state(self) -> dict[str, Any]:
         """Return the class and state of every copy, by its station's number."""
-        copies = {str(number): stored(copy) for number, copy in self._copies.items()}
+        copies = {str(number): method_state(copy) for number, copy in self._copies.items()}
         return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = self.factory.made_as(part["target"])
+            self._copies[int(number)] = copy = self.factory.create_as(part["target"])
             copy.name = self.name
             copy.restore(self._site_of(site, int(number)), part["state"])
 
@@ -332,7 +331,7 @@ class PerStation(Method):
         return iter(self._copies.items())
 
 
-class OfStation(View):
+class OneStationView(View):
     """A method that knows all stations, asked about one: several may stand at one place."""
 
     def __init__(self, inner: Method, number: int) -> None:
@@ -353,7 +352,7 @@ class OfStation(View):
         return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
 
 
-class OfStations(OfStation):
+class AllStationsView(OneStationView):
     """A method that knows all stations of powers, asked about each of them at every place."""
 
     def __init__(self, inner: Method, count: int) -> None:

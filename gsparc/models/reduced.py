@@ -14,26 +14,28 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.site_objects import SiteObjects
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Settings
 from gsparc.ops import SphereGrid
 
 log = logging.getLogger(__name__)
 
+Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
 AS_TRAINED = {"keep": 1.0, "stride": 1, "confidence": True}  # else: None
 Measured = dict[str, Tensor]
 
 
-def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
+def reduce_method(method: Method, settings: Settings, measured: Measured) -> Method:
     """Return the method with `settings`; itself when there are none."""
     return method.reduced(settings, measured) if settings else method
 
 
-def combinations(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
+def setting_combinations(
+    method: Method, grid: Mapping[str, Sequence[Any] | None]
+) -> Iterator[dict[str, Any]]:
     """Yield settings: none, then all combinations in `grid` of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.
     """
-    known = method.knobs()
+    known = method.reduction_settings()
     axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
     if "stride" in axes:
         axes["stride"] = _dividing(axes["stride"], method)
@@ -113,7 +115,7 @@ class MeanOnly(View):
         return Prediction(self._mean_at(query) if self._mean_at else self.inner.predict(query).mean)
 
 
-def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
+def coarsen_grid(grid: SphereGrid, stride: int) -> SphereGrid:
     """Return every `stride`-th pixel of the grid, the first row and column among them.
 
     Raises:
@@ -126,7 +128,7 @@ def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
     return replace(grid, height=height, width=width, **steps)
 
 
-class Filled(View):
+class Interpolated(View):
     """A method that answers on a coarser grid, its images interpolated to the full one.
 
     Args:
@@ -186,22 +188,22 @@ class Blended(View):
         return Prediction(mean, result.variance, result.unknown)
 
 
-def mean_alone(process: Method, settings: Settings | None = None) -> Method:
+def without_variance(process: Method, settings: Settings | None = None) -> Method:
     """Return the process without its variance, most of its cost, which the field has of its own."""
-    return reduced(process, {"confidence": False, **(settings or {})}, {})
+    return reduce_method(process, {"confidence": False, **(settings or {})}, {})
 
 
-def averaged(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
+def average_with_process(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
     """Return a reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.
 
     Args:
-        own: the field, reduced; `Filled` where it answers on a coarser grid.
+        own: the field, reduced; `Interpolated` where it answers on a coarser grid.
         process: fitted.
         blend: makes one of the field's mean and the process's.
     """
-    lean = mean_alone(process, {"stride": own.stride} if isinstance(own, Filled) else None)
-    if isinstance(own, Filled) and isinstance(lean, Filled):
-        return Filled(Blended(own.inner, lean.inner.predict, blend), own.grid, own.stride)
+    lean = without_variance(process, {"stride": own.stride} if isinstance(own, Interpolated) else None)
+    if isinstance(own, Interpolated) and isinstance(lean, Interpolated):
+        return Interpolated(Blended(own.inner, lean.inner.predict, blend), own.grid, own.stride)
     return Blended(own, lean.predict, blend)

@@ -20,7 +20,8 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.weights import comparable, real
+from gsparc.models.mixture.weights import in_error_unit, to_real_entries
+from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER
 from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
@@ -76,13 +77,13 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
     # Errors in units of their own deviation: d / s ~ N(0, 1).
     slope = seen.slope * std[place][:, None, None]
     own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, weight)
-    size = torch.zeros(count, 3, 3, dtype=torch.float64).index_add(0, place, own)
+    size = own.new_zeros(count, *own.shape[1:]).index_add(0, place, own)
     towards = torch.einsum("ndk,nd,nd->nk", slope, seen.residual, weight)
-    pull = torch.zeros(count, 3, dtype=torch.float64).index_add(0, place, towards)
+    pull = towards.new_zeros(count, *towards.shape[1:]).index_add(0, place, towards)
     whole, entries = float((seen.residual.square() * weight).sum()), int((weight > 0).sum())
     tried = []
     for share in SHARES:
-        precision = torch.eye(3, dtype=torch.float64) + size / share
+        precision = torch.eye(slope.shape[-1], dtype=slope.dtype) + size / share
         unit = torch.linalg.solve(precision, pull[..., None])[..., 0] / share
         # Negative log density of N(m, c v), as if places had no errors.
         exact = (whole / share + entries * math.log(share)) / 2
@@ -94,7 +95,9 @@ def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor,
     return unit * std[:, None], min(exact for _, exact, _ in tried) - least
 
 
-def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
+def refine_places(
+    field: ClosedForm, data: Measurements, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
     """Return rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
@@ -104,13 +107,14 @@ def refined(field: ClosedForm, data: Measurements, std: np.ndarray) -> tuple[np.
     try:
         rows, seen = _linearised(field, data)
     except ValueError as error:
-        return np.zeros(0, np.int64), np.zeros((0, 3)), f"position_std is not used: {error}"
+        none = np.zeros(0, np.int64)
+        return none, data.moving[none], f"position_std is not used: {error}"
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
     note = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
     if gain <= 0:
-        return rows, np.zeros((len(rows), 3)), f"{note}stay as measured"
+        return rows, np.zeros_like(data.moving[rows]), f"{note}stay as measured"
     return rows, moved.numpy()[place], f"{note}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
 
 
@@ -132,7 +136,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def mean(places: Tensor) -> Tensor:
-        return real(comparable(field.predict(at(places)).mean, site))
+        return to_real_entries(in_error_unit(field.predict(at(places)).mean, site))
 
     with torch.no_grad():
         result = field.predict(at(moving))  # what is computed once and kept must not be so inside `jvp`
@@ -140,19 +144,21 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":
         # From linear powers to decibels, to first order.
-        variance = variance * (10 / math.log(10) / left.mean.flatten().double().clamp_min(1e-30)).square()
-    residual = real(comparable(batch.target, site)) - real(comparable(left.mean, site))
+        variance = variance * (DECIBELS_PER_NAT / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
+    residual = to_real_entries(in_error_unit(batch.target, site)) - to_real_entries(
+        in_error_unit(left.mean, site)
+    )
     parts = 2 if batch.target.is_complex() else 1
     # Half of a circular variance is in either part.
     spread = (variance / parts)[:, None].expand_as(residual)
     if batch.mask is not None:
         spread = torch.where(batch.mask.flatten(1).repeat_interleave(parts, 1), spread, math.inf)
-    axes = torch.eye(3, dtype=torch.float64)[:, None].expand(3, len(moving), 3).contiguous()
+    axes = torch.eye(moving.shape[1]).to(moving)[:, None].expand(-1, *moving.shape).contiguous()
     slope = [torch.func.jvp(mean, (moving,), (axis,))[1].detach() for axis in axes]
     return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
 
 
-def displaced(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
+def move_rows(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
     """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
     name = "tx" if data.site.moving_end == "tx" else "rx_position"
     moved = getattr(data, name).copy()

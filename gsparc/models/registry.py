@@ -36,7 +36,7 @@ def methods() -> dict[str, str]:
     return {name.removesuffix(".yaml"): nodes[name]["_target_"] for name in sorted(nodes)}
 
 
-def known() -> dict[str, str]:
+def all_methods() -> dict[str, str]:
     """Return import paths of all methods by name: `methods()` and what plugins bring."""
     return plugins("model") | methods()
 
@@ -45,7 +45,7 @@ def method_class(name: str) -> type[MethodFactory]:
     """Return what makes the method `name`; `ValueError` with the nearest right name if there is none."""
     if name in methods():  # before plugins, whose entry points take milliseconds to read
         return get_class(methods()[name])
-    there = known()
+    there = all_methods()
     if name not in there:
         raise ValueError(f"no method is called {name!r}{suggest_or_list(name, there)}")
     return get_class(there[name])
@@ -74,13 +74,13 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
             if path not in KINDS:  # a term of the user's that they have imported
                 refuse_foreign(path)
     with heeded.apart():  # what is handed on is not used yet
-        method = instantiate(complete(deepcopy(node)), _convert_="all")
+        method = instantiate(fill_defaults(deepcopy(node)), _convert_="all")
     if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
 
 
-def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:
+def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:
     """Return a node, completed in place at any depth by what its class takes with defaults.
 
     Args:
@@ -114,5 +114,5 @@ def complete(node: DictConfig, own: Mapping[str, Any] | None = None, group: str 
             said = f"{group}.{name}={value}: is a group of settings"
             raise SettingError(f"{said}, given one by one: {some}=...")
         if isinstance(default, Mapping):
-            complete(value, default, f"{group}.{name}")
+            fill_defaults(value, default, f"{group}.{name}")
     return node

@@ -73,7 +73,7 @@ class RunFactors(Stored):
         return replace(data, target=target, noise_variance=noise, run=None)
 
 
-def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+def fit_run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return what rows are multiplied by to belong to the largest run, (runs,) complex128, by likelihood.
 
     Args:
@@ -82,16 +82,16 @@ def run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.
         run: (n,) int, numbers 0 to runs - 1, each of which occurs.
     """
     count = np.bincount(run)
-    return aligning(run_quadratic(inverse, target, run), target.shape[1] * count)
+    return best_run_factors(run_quadratic(inverse, target, run), target.shape[1] * count)
 
 
 def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Return M (runs, runs) complex128 of the module's text, of arguments as in `run_factors`."""
+    """Return M (runs, runs) complex128 of the module's text, of arguments as in `fit_run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member
 
 
-def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
+def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return factors (runs,) from M (runs, runs), of one process or summed over many, and runs' sizes.
 
     Args:
@@ -109,7 +109,8 @@ def aligning(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
             others = own[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
             # Positive root of own x^2 - pull x - power size = 0, the likelihood's slope by a factor's size.
-            length = (pull + np.sqrt(pull**2 + 4 * own[r] * power * size[r])) / max(2 * own[r], 1e-300)
+            twice = max(2 * own[r], np.finfo(float).tiny)
+            length = (pull + np.sqrt(pull**2 + 2 * twice * power * size[r])) / twice
             factors[r] = length * (others / pull if pull > 0 else 1.0)
         if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():
             break

@@ -13,6 +13,7 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.processes.powers import Rows
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
+DECIBELS_PER_NAT = 10 / math.log(10)
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -47,6 +48,11 @@ def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
     return rows / np.float32(255) if target.dtype == np.uint8 else rows
 
 
+def decibels(power: Tensor) -> Tensor:
+    """Return powers in decibels, of none the least that has a logarithm."""
+    return 10 * power.clamp_min(TINY_POWER).log10()
+
+
 def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
     """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
     if kind == "csi":
@@ -63,23 +69,23 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     if kind == "csi":
         return 2 * variance
     if kind == "rssi":
-        return variance * (math.log(10) / 10 * mean.flatten(1).mean(1)) ** 2
+        return variance * (mean.flatten(1).mean(1) / DECIBELS_PER_NAT) ** 2
     return variance
 
 
-def heard(data: Measurements, rows: np.ndarray) -> np.ndarray:
+def heard_rows(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
     return rows[data.side(rows) <= 0]
 
 
-def left_out_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+def unheard_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """Say what a fit to `heard(data, rows)` left out; nothing where all of rows (n,) were heard."""
     side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
 
-def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
+def power_rows(data: Measurements, rows: np.ndarray) -> Rows:
     """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
     return Rows(data.moving[rows], decibels, data.side(rows))

@@ -59,7 +59,7 @@ class Terms:
     options: tuple[str, ...]
 
 
-def called_for(
+def resolve_terms(
     switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
 ) -> Terms:
     """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
@@ -75,12 +75,12 @@ def called_for(
     request = networks or placed  # asks for Gaussians that are rendered
     distance = distant and init.name != "vectors"
     obstacles = {
-        "array": no_array(site, "rx", "the receiver moves")
+        "array": array_obstacle(site, "rx", "the receiver moves")
         or (networks and f"{networks} asks for networks")
         or ("attenuation.inverse_distance=true leaves no linear read-out" if distance else None),
-        "moving_array": no_array(site, "tx", "the receiver stands still")
+        "moving_array": array_obstacle(site, "tx", "the receiver stands still")
         or (request and f"{request} asks for rendered Gaussians"),
-        "phase": no_phase(data) or (request and f"{request} asks for rendered Gaussians"),
+        "phase": phase_obstacle(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
     # Powers always have their process: there the switch means nothing.
@@ -127,7 +127,7 @@ def _refuse_scene(
         raise ValueError(f"init=scene is not possible: {why}")
 
 
-def no_array(site: Site, static_end: str, otherwise: str) -> str | None:
+def array_obstacle(site: Site, static_end: str, otherwise: str) -> str | None:
     """Say why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
     if site.kind != "spectrum":
         return f"the target is {site.kind}, not a spectrum"
@@ -139,7 +139,7 @@ def no_array(site: Site, static_end: str, otherwise: str) -> str | None:
     return None
 
 
-def no_phase(data: Measurements) -> str | None:
+def phase_obstacle(data: Measurements) -> str | None:
     """Say why channels have no carrier phase that tells of places; None where they have."""
     site = data.site
     if site.kind != "csi":

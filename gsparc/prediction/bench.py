@@ -18,8 +18,8 @@ from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.channels import channels, summed
-from gsparc.ops.networks import networks, products
+from gsparc.ops.channels import channels, plain_channels
+from gsparc.ops.networks import networks, plain_networks
 from gsparc.ops.projection import Projection
 
 Call = Callable[[], object]
@@ -122,7 +122,7 @@ def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
     encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw))
     of = f"{count} x {BATCH}"
-    yield Case("emission", of, lambda: networks(encoded, *layers), lambda: products(encoded, *layers))
+    yield Case("emission", of, lambda: networks(encoded, *layers), lambda: plain_networks(encoded, *layers))
     steering = torch.randn(count, ANTENNAS, 2, generator=draw)
     # Up to 100 ns, as in a room, and in float64: at 2.4 GHz these are 240 turns.
     delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
@@ -130,7 +130,7 @@ def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
     yield Case(
         "channel", f"{count} to {ANTENNAS} x {SUBCARRIERS}",
         lambda: channels(gains, steering, delays, *TONES, SUBCARRIERS),
-        lambda: summed(gains, steering, delays, TONES, SUBCARRIERS),
+        lambda: plain_channels(gains, steering, delays, TONES, SUBCARRIERS),
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_kernel, principal_components
-from gsparc.models.method import Method, Prediction, answered, predictions
+from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, join_evidence
@@ -33,7 +33,7 @@ def gather_evidence(method: Method, data: Measurements, fold: Fold, rows: np.nda
     evidence = join_evidence(
         [
             Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
-            for chosen, batch, said in predictions(method, data, rows)
+            for chosen, batch, said in predict_in_batches(method, data, rows)
         ]
     )
     return replace(evidence, scores=evidence.scores | rival_scores(data, fold, evidence.row))
@@ -172,7 +172,7 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def store_trusted(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.amend(path, {KEY: stored(trusted)})
+    checkpoint.update_extra(path, {KEY: stored(trusted)})
 
 
 def read_trusted(extra: Mapping[str, Any]) -> Trusted:
@@ -245,7 +245,7 @@ class ConfidenceMixin:
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self.queries.query(tx, rx)
-            sure = self._confidence(answered(self._whole, query), query)
+            sure = self._confidence(predict_with_threads(self._whole, query), query)
         if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
         return sure, single, as_torch

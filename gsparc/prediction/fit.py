@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint, fitting
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -78,10 +78,10 @@ def fit(
         raise ValueError(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
-    factory = for_stations(kind(**own), data)
+    factory = by_station(kind(**own), data)
     fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
-    method, report = fitting.fit(factory, data, fold, context)
+    method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
         log.info("%s", note)
     if save is not None:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.method import Method, Prediction, suited_threads
+from gsparc.models.method import Method, Prediction, suitable_threads
 from gsparc.ops import Pose
-from gsparc.ops.transforms import carries_tangent, mapped, transforming
+from gsparc.ops.transforms import carries_tangent, has_vmap_axis, transform_is_active
 from gsparc.prediction.query import Queries
 
 
@@ -41,7 +41,7 @@ def predict_with_gradients(
     for end, value in ends.items():
         if value is not None and not isinstance(value, Tensor):
             raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
-    if mapped(*ends.values()):
+    if has_vmap_axis(*ends.values()):
         raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
     if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
         raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
@@ -50,8 +50,8 @@ def predict_with_gradients(
     # The origin goes in float64: in UTM coordinates float32 has no centimetres.
     local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
     at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
-    with suited_threads(method, len(query)):
-        if transforming() and method not in prepared:  # what it keeps must not be a transform's
+    with suitable_threads(method, len(query)):
+        if transform_is_active() and method not in prepared:  # what it keeps must not be a transform's
             prepared.append(method)
             with torch._C._DisableFuncTorch(), torch.no_grad():
                 method.predict(query)

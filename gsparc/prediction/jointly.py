@@ -9,7 +9,7 @@ import torch
 
 from gsparc.data.schema import Site
 from gsparc.models.method import HasJoint, HasProcess, Method
-from gsparc.models.per_station import OfStation, PerStation
+from gsparc.models.per_station import OneStationView, PerStation
 from gsparc.prediction.query import Queries
 
 
@@ -79,8 +79,8 @@ class JointMixin:
         (100, 2)
         """
         places = self.queries.query(tx, rx, torch.float64).query.places(self.site)
-        known = self.method.joint() if isinstance(self.method, OfStation) else None
-        if isinstance(self.method, OfStation) and known is not None:
+        known = self.method.joint() if isinstance(self.method, OneStationView) else None
+        if isinstance(self.method, OneStationView) and known is not None:
             station = torch.full((len(places),), self.method.number)
             _, covariance, noise = known.joint(places[None], station)
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])

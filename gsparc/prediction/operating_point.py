@@ -15,9 +15,9 @@ import torch
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
-from gsparc.models.pareto import Point, Settings
-from gsparc.models.reduced import Measured, reduced
+from gsparc.models.reduced import Measured, reduce_method
 from gsparc.prediction.confidence import read_trusted
+from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, time_interleaved
 from gsparc.processes.stored import Stored, restored, stored
@@ -52,7 +52,7 @@ def store_points(path: Path, points: Sequence[Point], figure: str, measured: Mea
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.amend(path, {KEY: {"points": stored(found), "measured": measured}})
+    checkpoint.update_extra(path, {KEY: {"points": stored(found), "measured": measured}})
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
@@ -87,7 +87,7 @@ def choose_within_budget(
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
     # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
-    ways = [reduced(method, point.settings, measured) for point in points]
+    ways = [reduce_method(method, point.settings, measured) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
     ends = 2 if site.static_end is None else 1
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)

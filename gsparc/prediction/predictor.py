@@ -17,8 +17,8 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
-from gsparc.models.method import HasGaussians, Method, Prediction, answered
-from gsparc.models.per_station import PerStation, of_station
+from gsparc.models.method import HasGaussians, Method, Prediction, predict_with_threads
+from gsparc.models.per_station import PerStation, station_site
 from gsparc.physics.row_factors import freedom_words
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
@@ -114,7 +114,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         method, whole = (
             one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
         )
-        return self._with(method, whole, of_station(self.site, number), self._unit)
+        return self._with(method, whole, station_site(self.site, number), self._unit)
 
     def _with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
@@ -151,13 +151,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         if grad:
             return self._slopes(self._whole, tx, rx, wanted)[0]
         query = self.queries.query(tx, rx).query
-        own = answered(self._whole, query)
+        own = predict_with_threads(self._whole, query)
         sure = self._confidence(own, query)
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def asked(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local, in stored units."""
-        return answered(self.method, query)
+        return predict_with_threads(self.method, query)
 
     def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
@@ -182,7 +182,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
         def ask(asked: Predictor) -> Any:
             query, single, as_torch = asked.queries.query(tx, rx)
-            said = _in_unit(answered(asked._whole, query), asked._in(unit))
+            said = _in_unit(predict_with_threads(asked._whole, query), asked._in(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float()
@@ -204,7 +204,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         # One call for all stations where the method has one, else a call for each.
         every = self.method.every() if isinstance(self.method, PerStation) else None
         if every is not None:
-            return ask(self._with(every, None, of_station(self.site, 0), self._unit))
+            return ask(self._with(every, None, station_site(self.site, 0), self._unit))
         stations = self._stations()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)
@@ -330,7 +330,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             moments, single = self._slopes(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return match_input(_in_unit(answered(self.method, query), wanted).mean, single, as_torch)
+        return match_input(_in_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch)
 
     def _slopes(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
@@ -343,7 +343,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
 def keep(path: str | Path, extra: Mapping[str, Any]) -> None:
     """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
-    checkpoint.amend(path, extra)
+    checkpoint.update_extra(path, extra)
 
 
 def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:

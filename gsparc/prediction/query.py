@@ -12,7 +12,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.query import Query
 from gsparc.data.schema import End, Site
 from gsparc.ops import Pose
-from gsparc.ops.transforms import numbers
+from gsparc.ops.transforms import to_numpy
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
@@ -87,7 +87,7 @@ class Queries:
 
     def _rotation(self, rx: Any, count: int) -> np.ndarray:
         if isinstance(rx, Pose):
-            rotation = numbers(rx.rotation).astype(np.float64)
+            rotation = to_numpy(rx.rotation).astype(np.float64)
             if rotation.ndim == 3 and len(rotation) not in (1, count):
                 raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
             return rotation
@@ -118,7 +118,7 @@ def read_places(end: str, value: Any) -> np.ndarray:
     ValueError: rx= must be (3,) or (B, 3) [m], got shape (2,)
     """
     try:
-        array = numbers(value) if isinstance(value, Tensor) else np.asarray(value)
+        array = to_numpy(value) if isinstance(value, Tensor) else np.asarray(value)
         array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
     except (TypeError, ValueError):
         raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None

@@ -13,7 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory, Reconditions
-from gsparc.models.per_station import PerStation, for_stations, trained_stations
+from gsparc.models.per_station import PerStation, by_station, trained_stations
 from gsparc.training.context import FitContext
 
 
@@ -45,7 +45,7 @@ class Learned:
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""
-        return fitting.fit(for_stations(self.factory, self.data), self.data, fold, context)[0]
+        return fitting.fit_or_resume(by_station(self.factory, self.data), self.data, fold, context)[0]
 
     def without(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.

@@ -17,7 +17,7 @@ import torch
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
-from gsparc.models.method import Method, answered
+from gsparc.models.method import Method, predict_with_threads
 
 Key = TypeVar("Key")
 Call = Callable[[int], object]
@@ -109,7 +109,7 @@ def cycle_queries(methods: Mapping[Key, Method], queries: Sequence[Query]) -> di
     """Return calls that answer one of `draw_queries` each, another one every time."""
 
     def call(method: Method) -> Call:
-        return lambda turn: answered(method, queries[turn % len(queries)])
+        return lambda turn: predict_with_threads(method, queries[turn % len(queries)])
 
     return {name: call(method) for name, method in methods.items()}
 

@@ -18,7 +18,7 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
-from gsparc.ops.transforms import followed
+from gsparc.ops.transforms import is_differentiated
 from gsparc.processes.worker import raise_if_cancelled
 
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
@@ -164,7 +164,7 @@ def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> lis
 
     Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
     """
-    if followed(*values) or max(len(one.lower) for one in factors) > ALONE:
+    if is_differentiated(*values) or max(len(one.lower) for one in factors) > ALONE:
         return [one.whitened(part) for one, part in zip(factors, values, strict=True)]
     single, result = [part.float().numpy() for part in values], []
     # OpenBLAS multiplies few columns in a third of torch's time.
@@ -182,7 +182,7 @@ def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
 
 def _alone(*parts: Tensor) -> bool:
     """Whether these are single matrices for one thread of the processor, without gradients."""
-    grows = followed(*parts)
+    grows = is_differentiated(*parts)
     fits = all(part.dim() == 2 and part.device.type == "cpu" for part in parts)
     fits = fits and parts[0].dtype not in (torch.float16, torch.bfloat16)
     many = len(parts[0]) > ALONE and torch.get_num_threads() > 1

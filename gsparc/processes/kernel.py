@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import needs_reference
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
 
@@ -33,7 +33,7 @@ def apart(a: Tensor, b: Tensor) -> Tensor:
     >>> apart(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
     tensor([[5.]])
     """
-    if not beyond_kernels(a, b):
+    if not needs_reference(a, b):
         return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     squared = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)  # `cdist` has no forward mode
     none = squared == 0

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from gsparc.ops.queries import nearest_weights, served
-from gsparc.ops.transforms import numbers
+from gsparc.ops.queries import has_query_kernel, nearest_weights
+from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
@@ -138,7 +138,7 @@ class Nearest(Posterior):
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
         parts = (self._answer(queries[b], None if without is None else without[b], exact) for b in blocks)
-        if len(blocks) < 2 or not served(queries):
+        if len(blocks) < 2 or not has_query_kernel(queries):
             return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
         first = next(parts)
         result = Answer(
@@ -150,7 +150,7 @@ class Nearest(Posterior):
         return result
 
     def _answer(self, queries: Tensor, without: np.ndarray | None, exact: bool) -> Answer:
-        index = torch.from_numpy(self.near.nearest(numbers(queries), without, self.most))
+        index = torch.from_numpy(self.near.nearest(to_numpy(queries), without, self.most))
         weights, known = self._weights(queries, index)
         rest = self.rest[index]
         if exact:
@@ -167,7 +167,7 @@ class Nearest(Posterior):
     def _weights(self, queries: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """Of rows (B, k), see `weights_of`."""
         kernel = self.prior.kernel
-        if (lengths := kernel.compiled) and served(queries):
+        if (lengths := kernel.compiled) and has_query_kernel(queries):
             result = nearest_weights(queries, self.places, self._solvable, index, lengths, kernel.shares)
             if result is None:
                 raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.ops.transforms import followed, numbers
+from gsparc.ops.transforms import is_differentiated, to_numpy
 from gsparc.processes.kernel import apart
 from gsparc.processes.stored import Stored
 
@@ -143,8 +143,8 @@ def with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOURS) ->
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     """Return distances (B,) [m] from queries (B, D) float64 to a tree's nearest place, with autograd."""
-    distance, row = tree.query(numbers(queries))
-    if not followed(queries):
+    distance, row = tree.query(to_numpy(queries))
+    if not is_differentiated(queries):
         return torch.from_numpy(distance)
     return apart(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
 

@@ -42,7 +42,7 @@ class FitReport:
     limited_by: Clock | None = None
     cost: Cost = NO_COST
 
-    def costing(self, cost: Cost) -> FitReport:
+    def with_cost(self, cost: Cost) -> FitReport:
         """Return the report with its stages, which are logged."""
         log.info("cost: %s", cost.described(self.limited_by))
         return replace(self, cost=cost)
@@ -59,7 +59,7 @@ class FitContext:
         budget_s: seconds after which searches and steps end with what they have; None: no end.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
-            `best_stations` says.
+            `choose_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
         race: the best of other solutions on these groups: searches end that fall behind.
@@ -117,17 +117,17 @@ class FitContext:
     def within(self, folder: str, **changes: Any) -> FitContext:
         """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
         if self.loggers:
-            from gsparc.training.tracking import Part  # imports Lightning
+            from gsparc.training.tracking import PartLogger  # imports Lightning
 
-            changes = {"loggers": [Part(one, folder) for one in self.loggers], **changes}
+            changes = {"loggers": [PartLogger(one, folder) for one in self.loggers], **changes}
         # No folder stays none: below an empty path lies the working directory.
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
     def curve(
         self, seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
     ) -> None:
-        """Add a point to the learning curve, in the folder and the loggers; see `curve.point`."""
-        row = curve.point(seconds, what, error, step, **figures)
+        """Add a point to the learning curve, in the folder and the loggers; see `curve.curve_row`."""
+        row = curve.curve_row(seconds, what, error, step, **figures)
         # All rows again: a file that appears by renaming cannot be appended to.
         curve.write(self.run_dir, [*curve.read(self.run_dir), row])
         curve.log(self.loggers, row)

@@ -15,7 +15,7 @@ FIGURES = ("num_gaussians", "train/task_loss", "val/ssim_gauss", "val/psnr_db", 
 COLUMNS = ("seconds", "what", "error", "step", *FIGURES)
 
 
-def point(
+def curve_row(
     seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
 ) -> dict[str, Any]:
     """Return a row of the curve; what is not known is empty.

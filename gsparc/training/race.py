@@ -20,7 +20,7 @@ FAR = 5.0  # times the error of the best: what stalls there has a part of its ow
 STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 
 
-class Behind(ValueError):
+class FellBehind(ValueError):
     """A candidate ends: no mean of it and another is surely better than that."""
 
 
@@ -69,9 +69,11 @@ class Race:
             return now
         known = f"what misses {self.error:.3f} of the energy of rows held out"
         if now > FAR * mean_square(best):
-            raise Behind(f"{what}: {now / mean_square(best):.0f} times the error of {known}")
+            raise FellBehind(f"{what}: {now / mean_square(best):.0f} times the error of {known}")
         if gain + SURE * error < LEAST_GAIN:
-            raise Behind(f"{what}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}")
+            raise FellBehind(
+                f"{what}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}"
+            )
         return now
 
 

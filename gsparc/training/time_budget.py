@@ -83,7 +83,7 @@ def less_repeatable(*clocks: Clock | None) -> Clock | None:
 
 
 class TimeBudget:
-    """Counts from where it is made, but for pauses.
+    """Counts from where it is made.
 
     Seconds decide nothing but an early end: what a fit does is counted (`Effort`), and repeats exactly.
 
@@ -105,7 +105,7 @@ class TimeBudget:
         self.seconds, self.clock, self.limited = seconds, clock, False
         self._threads = torch.get_num_threads()  # searches change it for a while
         self._before = before
-        self._since: Spent | None = self._now()
+        self._since = self._now()
 
     def _now(self) -> Spent:
         # Seconds of threads add up: divided, both clocks agree where all of them work.
@@ -114,7 +114,7 @@ class TimeBudget:
     @property
     def counted(self) -> Spent:
         """Seconds by both clocks."""
-        return self._before if self._since is None else self._before + (self._now() - self._since)
+        return self._before + (self._now() - self._since)
 
     @property
     def spent(self) -> float:
@@ -136,24 +136,18 @@ class TimeBudget:
         """Count what was spent elsewhere, too."""
         self._before = self._before + more
 
-    def pause(self) -> None:
-        """Count no more until `go`."""
-        self._before, self._since = self.counted, None
-
-    def go(self) -> None:
-        """Count again."""
-        if self._since is None:
-            self._since = self._now()
+    def restart(self) -> None:
+        """Count on from now, with what was counted as spent before: what another process goes on from."""
+        self._before, self._since = self.counted, self._now()
 
     def moved(self) -> None:
         """Count on in another process, whose processor time began with it."""
-        if self._since is not None:
-            # The wall's clock is the machine's; a new process's own begins at 0.
-            self._since = Spent(self._since.wall, 0.0)
+        # The wall's clock is the machine's; a new process's own begins at 0.
+        self._since = Spent(self._since.wall, 0.0)
 
     def over(self) -> bool:
         """Whether it is spent; whoever asks then ends what it does."""
         result = self.spent > self.seconds
-        # For good: what it ended stays ended, though time may be charged or paused later.
+        # For good: what it ended stays ended, though time may be charged later.
         self.limited |= result
         return result

@@ -25,7 +25,7 @@ TAGS = ("dataset", "split", "model", "paper", "experiment")  # groups whose choi
 NAME = 120  # characters
 
 
-class Part(Logger):
+class PartLogger(Logger):
     """The dashboard of a run for a part of it, a refit or a fold: figures under its name, a series each."""
 
     def __init__(self, whole: Logger, part: str) -> None:
@@ -52,7 +52,7 @@ class Part(Logger):
 
 
 @contextmanager
-def opened(config: DictConfig) -> Iterator[list[Logger]]:
+def open_loggers(config: DictConfig) -> Iterator[list[Logger]]:
     """Yield loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
     made: list[Logger] = []
     settings: Any = OmegaConf.to_container(config, resolve=True)

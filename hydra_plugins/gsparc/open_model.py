@@ -5,6 +5,6 @@ from __future__ import annotations
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-# What is no setting of the class is refused where the method is built: `gsparc.models.registry.complete`.
+# What is no setting is refused where the method is built: `gsparc.models.registry.fill_defaults`.
 OPEN = {"model": OmegaConf.create({}, flags={"struct": False})}
 ConfigStore.instance().store("model", OPEN, "command", "_global_", "gsparc")

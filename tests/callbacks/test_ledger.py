@@ -39,7 +39,7 @@ def test_validation_and_pictures_are_not_billed(clock, module):
     clock.value += 100
     bill.on_validation_end(run, module)
     clock.value += 2
-    with CostLedger.paused_in(run):
+    with CostLedger.pause_ledger(run):
         clock.value += 1000
     clock.value += 1
     bill.on_train_end(run, module)
@@ -52,9 +52,9 @@ def test_a_pause_of_a_stopped_watch_or_of_none_starts_nothing(clock):
         clock.value += 5
     clock.value += 5
     assert bill.elapsed() == 0
-    with CostLedger.paused_in(trainer()) as nothing:
+    with CostLedger.pause_ledger(trainer()) as nothing:
         assert nothing is None
-    assert CostLedger.seconds_in(trainer()) is None
+    assert CostLedger.training_seconds(trainer()) is None
 
 
 def test_the_curve_has_accuracy_beside_seconds(clock, module):

@@ -8,7 +8,7 @@ from access_points import walks
 from campaigns import brief, compose, spectra
 from towns import trained
 
-from gsparc.commands.train import Objects, train
+from gsparc.commands.train import TrainedRun, train
 
 
 @pytest.fixture(scope="session")
@@ -18,13 +18,13 @@ def spectra_file(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def field(spectra_file, tmp_path_factory) -> Objects:
+def field(spectra_file, tmp_path_factory) -> TrainedRun:
     """Forty Gaussians trained on them."""
     return train(compose(*brief(spectra_file)), tmp_path_factory.mktemp("field"))[1]
 
 
 @pytest.fixture(scope="session")
-def halfway(spectra_file, tmp_path_factory) -> Objects:
+def halfway(spectra_file, tmp_path_factory) -> TrainedRun:
     """The same on the training rows alone; beside its model lies the training state of step 15 of 20."""
     often = "callbacks.checkpoint.interval=15"
     config = compose(*brief(spectra_file, "model.refit=false", often))

@@ -23,7 +23,7 @@ from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.fitting import Origin
-from gsparc.models.loading import module_of
+from gsparc.models.loading import load_module
 from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
@@ -78,9 +78,9 @@ def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, w
     before, now = (Origin.of(d, fold, FitContext()) for d in (data, change(data)))
     stored = checkpoint.read(halfway.checkpoints[0].with_name("last.ckpt"))
     stored = replace(stored, config="", extra=before.marks())
-    before.refuse_other(stored)
+    before.require_same(stored)
     with pytest.raises(ValueError, match=f"was trained with {what}: go on"):
-        now.refuse_other(stored)
+        now.require_same(stored)
 
 
 def test_weights_to_start_from_beside_a_run_to_go_on_from_are_those_it_began_with(
@@ -174,7 +174,7 @@ def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp
 @pytest.mark.parametrize("name", ["model.ckpt", "last.ckpt"])
 def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra_file, halfway):
     path = halfway.checkpoints[0].with_name(name)
-    module = module_of(path)
+    module = load_module(path)
     data = datamodule({"name": "own", "file": str(spectra_file)}).measurements
     rows = np.arange(20)
     loaded = Loaded(data, 8).use(Fold(rows, rows[:0], rows))
@@ -186,7 +186,7 @@ def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra
 
 def test_a_method_without_a_field_has_no_module(others):
     with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
-        module_of(others["nearest"])
+        load_module(others["nearest"])
 
 
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):

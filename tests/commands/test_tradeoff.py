@@ -17,8 +17,8 @@ from gsparc.evaluation.experiment.tradeoff import RecordingView, closeness_db, w
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
-from gsparc.models.pareto import Point
 from gsparc.prediction import operating_point
+from gsparc.prediction.pareto import Point
 from gsparc.prediction.timing import ClockSettings, time_interleaved
 from gsparc.training import tracking
 

@@ -18,7 +18,7 @@ from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
-from gsparc.commands.train import Objects, main, train
+from gsparc.commands.train import TrainedRun, main, train
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment import options
 from gsparc.models import checkpoint
@@ -47,7 +47,7 @@ def test_a_run_leaves_facts_and_files(kind, tmp_path):
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
     assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
     assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
-    assert isinstance(objects, Objects) and isinstance(objects.methods[0], LearnedField)
+    assert isinstance(objects, TrainedRun) and isinstance(objects.methods[0], LearnedField)
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"model.ckpt", "per_sample.csv", "split.json", "learning_curve.csv"} <= written
 
@@ -85,7 +85,7 @@ def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, 
         train(short(spectra_file), tmp_path)
     text = (ROOT / "ARCHITECTURE.md").read_text().partition("Calls down to the Trainer: ")[2]
     named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
-    assert ["task", "run_once", "_train_and_show", *called] == named
+    assert ["task", *called] == named
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):

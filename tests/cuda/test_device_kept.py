@@ -36,15 +36,15 @@ class Shapes:
 
 
 def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
-    """`validation.poses`, which does not look at poses on a GPU, either."""
+    """`validation.check_poses`, which does not look at poses on a GPU, either."""
     return Pose(pose.position.to(means).reshape(-1, 3), pose.rotation.to(means).reshape(-1, 3, 3))
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi"])
 def test_a_training_loss_and_its_gradients_stay_on_the_models_device(kind, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(backends, "choose", lambda name, device: Shapes)
-    monkeypatch.setattr(backends, "named", lambda name: Shapes)
-    monkeypatch.setattr(validation, "poses", unlooked)
+    monkeypatch.setattr(backends, "choose_backend", lambda name, device: Shapes)
+    monkeypatch.setattr(backends, "backend_named", lambda name: Shapes)
+    monkeypatch.setattr(validation, "check_poses", unlooked)
     data = campaign(kind)
     made = module(data, tmp_path).to("meta")
     batch = data.batch(np.arange(6)).to("meta")

@@ -36,7 +36,7 @@ def nothing_loaded(monkeypatch):
 
 def explained(monkeypatch) -> str:
     with pytest.raises(BackendUnavailable) as caught:
-        backends.named("cuda")
+        backends.backend_named("cuda")
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

@@ -8,7 +8,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, cut_inner_folds, inner_folds
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
-from gsparc.models.per_station import UNHEARD, of_station
+from gsparc.models.per_station import UNHEARD, station_site
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2
@@ -144,7 +144,7 @@ def test_of_stations_learned_together_squares_are_those_of_what_moves():
     data = from_arrays({"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)})
     settings = SplitSettings("blocks", side_m=5.0)
     outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
-    together = data.subset(np.arange(len(data)), of_station(data.site, UNHEARD))
+    together = data.subset(np.arange(len(data)), station_site(data.site, UNHEARD))
     assert together.moving.shape[1] == 6
     inner, plain = (cut_inner_folds(d, outer, settings, 3, 0) for d in (together, data))
     assert inner.name == "blocks"

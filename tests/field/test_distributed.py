@@ -9,7 +9,7 @@ from invented import invent
 from several import Kill, trained
 from states import same
 
-from gsparc.field.distributed import SummedGradients, add_up, agreed, count
+from gsparc.field.distributed import SummedGradients, first_process_value, process_count, sum_gradients
 
 
 def test_strategies_that_share_batches_are_known_by_name():
@@ -26,9 +26,9 @@ def test_strategies_that_share_batches_are_known_by_name():
 def test_alone_nothing_is_changed():
     one, none = torch.zeros(3, requires_grad=True), torch.zeros(2, requires_grad=True)
     one.grad = torch.tensor([1.0, 2.0, 3.0])
-    add_up([one, none])
+    sum_gradients([one, none])
     assert one.grad.tolist() == [1, 2, 3] and none.grad is None
-    assert agreed(0.5, None) == 0.5 and count() == 1
+    assert first_process_value(0.5, None) == 0.5 and process_count() == 1
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 import torch
 
 from gsparc.field import edit
-from gsparc.field.edit import Edit, resize, row_parameters
+from gsparc.field.edit import Edit, resize_gaussians, row_parameters
 from gsparc.field.gaussians import GaussianField
 
 
@@ -33,7 +33,7 @@ def test_one_edit_moves_everything_together():
     shared = root.shared
     keep = torch.tensor([True, False, True, True, False, True])
     replace = {"gaussians.means": torch.full((2, 3), 9.0)}
-    edit.apply(Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer)
+    edit.apply_edit(Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer)
     for name, parameter in row_parameters(root, 6).items():
         assert torch.equal(parameter[:4], rows[name][keep])
         wanted = replace.get(name, rows[name][[1, 3]])
@@ -50,7 +50,9 @@ def test_one_edit_moves_everything_together():
 def test_an_edit_before_the_first_step_has_no_moments_to_move():
     root = Root()
     optimizer = torch.optim.Adam([{"params": [p]} for p in root.parameters()])
-    edit.apply(Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer)
+    edit.apply_edit(
+        Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer
+    )
     assert len(root.gaussians) == 1 and root.gaussians.ids.tolist() == [6]
     held = {id(group["params"][0]) for group in optimizer.param_groups}
     assert held == {id(p) for p in root.parameters()}
@@ -59,7 +61,7 @@ def test_an_edit_before_the_first_step_has_no_moments_to_move():
 def test_resize_makes_room_for_a_state_dict():
     larger, smaller = Root(9), Root(4)
     smaller.shared = torch.nn.Parameter(torch.zeros(9, 3))
-    resize(smaller, smaller.gaussians, 9)
+    resize_gaussians(smaller, smaller.gaussians, 9)
     smaller.load_state_dict(larger.state_dict())
     assert torch.equal(smaller.gaussians.means, larger.gaussians.means) and len(smaller.gaussians) == 9
 
@@ -68,7 +70,7 @@ def test_what_is_not_learned_is_not_learned_after_an_edit_either():
     """The delays of a single tone began to ask for gradients, without a group of the optimizer."""
     root = Root()
     root.head.weight.requires_grad_(False)
-    edit.apply(Edit(torch.ones(6, dtype=torch.bool), torch.tensor([1])), root, root.gaussians)
+    edit.apply_edit(Edit(torch.ones(6, dtype=torch.bool), torch.tensor([1])), root, root.gaussians)
     assert len(root.head.weight) == 7 and not root.head.weight.requires_grad
-    resize(root, root.gaussians, 3)
+    resize_gaussians(root, root.gaussians, 3)
     assert not root.head.weight.requires_grad and root.gaussians.means.requires_grad

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
+from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]])
 RECEIVER = torch.tensor([3.0, 0.0, 1.0])
@@ -10,14 +10,14 @@ TURN = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # boresight along x
 
 def test_uniform_fills_the_enlarged_box():
     torch.manual_seed(0)
-    field = initial_field(FieldSettings(count=2000, placement="uniform", margin=0.5), BOX, None, None)
+    field = create_field(FieldSettings(count=2000, placement="uniform", margin=0.5), BOX, None, None)
     low, high = field.means.min(0).values, field.means.max(0).values
     assert (low >= BOX[0] - 0.5).all() and (high <= BOX[1] + 0.5).all()
     assert torch.allclose(low, BOX[0] - 0.5, atol=0.05) and torch.allclose(high, BOX[1] + 0.5, atol=0.05)
 
 
 def test_sphere_surrounds_the_receiver_above_its_horizon():
-    field = initial_field(FieldSettings(count=500, placement="sphere", near=1, far=6), BOX, RECEIVER, TURN)
+    field = create_field(FieldSettings(count=500, placement="sphere", near=1, far=6), BOX, RECEIVER, TURN)
     local = (field.means - RECEIVER) @ TURN
     distance = local.norm(dim=1)
     assert distance.min() >= 1 and distance.max() <= 6 and (local[:, 2] > 0).all()
@@ -28,31 +28,31 @@ def test_sphere_surrounds_the_receiver_above_its_horizon():
 
 def test_sphere_needs_a_receiver_that_stays():
     with pytest.raises(ValueError, match="use init=uniform"):
-        initial_field(FieldSettings(placement="sphere"), BOX, None, None)
+        create_field(FieldSettings(placement="sphere"), BOX, None, None)
 
 
 def test_an_unknown_start_is_refused():
     with pytest.raises(ValueError, match="choose uniform or sphere"):
-        initial_field(FieldSettings(placement="auto"), BOX, RECEIVER, TURN)
+        create_field(FieldSettings(placement="auto"), BOX, RECEIVER, TURN)
 
 
 @pytest.mark.parametrize("init", ["uniform", "sphere"])
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_opacity_scale_and_ids_are_as_asked(init, count):
     settings = FieldSettings(count=count, placement=init, opacity=0.2, scale=0.4)
-    field = initial_field(settings, BOX, RECEIVER, TURN)
+    field = create_field(settings, BOX, RECEIVER, TURN)
     assert len(field) == count and field.ids.tolist() == list(range(count)) and int(field.next_id) == count
     assert torch.allclose(field.opacities, torch.full((count,), 0.2))
     assert torch.allclose(field.scales, torch.full((count, 3), 0.4))
     assert (
-        initial_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN).scales.isfinite().all()
+        create_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN).scales.isfinite().all()
     )
 
 
 def test_a_flat_box_still_gives_positive_scales():
     """Positions in one plane without a margin: a volume of 0."""
     flat = torch.tensor([[0.0, 0, 0], [4, 4, 0]])
-    field = initial_field(FieldSettings(count=10, placement="uniform", margin=0.0), flat, None, None)
+    field = create_field(FieldSettings(count=10, placement="uniform", margin=0.0), flat, None, None)
     assert (field.scales > 0).all() and field.log_scales.isfinite().all()
 
 

@@ -27,7 +27,7 @@ def measured(tmp_path_factory):
 
 def fitted(measured, folder, *more, steps=40, **context):
     file, data, fold = measured
-    method = build(compose(*brief(file, *COLD, *more)).model).made_for(data)
+    method = build(compose(*brief(file, *COLD, *more)).model).create_for(data)
     method.fit(data, fold, short(folder, steps, validate_every=5, **context))
     return method
 
@@ -59,7 +59,7 @@ def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tm
     caplog.set_level("INFO")
     _, data, fold = measured
     wild = "init=images", "model.keep_best=true", "model.optimizer.emission=50.0"
-    method = build(compose(*brief(measured[0], *wild)).model).made_for(data)
+    method = build(compose(*brief(measured[0], *wild)).model).create_for(data)
     method.fit(data, fold, FitContext(tmp_path, batch_size=8))
     assert method.steps == 0 and method.steps_taken == PATIENCE * (60 // LOOKS)
     assert f"{PATIENCE} looks without a sure gain" in caplog.text

@@ -4,7 +4,7 @@ import torch
 
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
-from gsparc.field.frozen import frozen_view
+from gsparc.field.frozen import freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose, StalePlan
@@ -77,7 +77,7 @@ def test_only_the_gaussians_that_a_static_receiver_sees_emit(campaign):
     batch = data.batch(np.arange(6))
     field = model(data, field=FieldSettings(count=60, placement="uniform", margin=4.0))
     want = field(batch.tx, batch.rx)
-    view = frozen_view(field, batch.rx)
+    view = freeze_view(field, batch.rx)
     seen = int(want.raster.visible.sum())
     assert 0 < seen < 60 and len(view.visible.gaussians) == seen
     for some in (batch.tx, batch.tx[:1]):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from gsparc.field.optimizer import OptimizerSettings, kind_of, optimizer_for, rate_factor, scheduler_for
+from gsparc.field.optimizer import OptimizerSettings, optimizer_for, rate_factor, rate_kind, scheduler_for
 
 SETTINGS = OptimizerSettings(positions=1e-3, positions_final=1e-5, decay=0.1)
 
@@ -27,10 +27,10 @@ def test_warmup_rises_to_the_full_rate():
 
 
 def test_every_parameter_has_its_rate():
-    assert kind_of("gaussians.means") == "positions"
-    assert kind_of("confidence.network.0.weight") == "confidence"
+    assert rate_kind("gaussians.means") == "positions"
+    assert rate_kind("confidence.network.0.weight") == "confidence"
     with pytest.raises(KeyError, match=r"gsparc\.field\.optimizer\.KINDS"):
-        kind_of("gaussians.means_too")
+        rate_kind("gaussians.means_too")
 
 
 def test_one_tensor_per_group_at_its_own_rate(campaign):

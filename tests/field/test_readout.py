@@ -7,7 +7,7 @@ from contexts import loaded, short
 
 from gsparc.callbacks import Densify
 from gsparc.field import edit
-from gsparc.field.readout import solved_again
+from gsparc.field.readout import solve_readout
 from gsparc.models.registry import build
 
 
@@ -16,7 +16,7 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     """Copies with their parents' opacities and emissions changed spectra by .1 and cost 7 dB."""
     file = spectra(tmp_path / "own.npz", rows=60)
     data, fold = loaded(file)
-    method = build(compose(*brief(file, "init=images", *more)).model).made_for(data)
+    method = build(compose(*brief(file, "init=images", *more)).model).create_for(data)
     method.fit(data, fold, short(tmp_path, 0))
     model, batch = method.fitted(), data.batch(fold.train[:8])
     densify = Densify(grad_threshold=0.5)
@@ -24,8 +24,8 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     densify.statistics["gradient"][::20], densify.statistics["seen"] = 1.0, torch.ones(len(model.gaussians))
     planned = densify.plan(model, torch.Generator().manual_seed(0), in_place=True)
     before = model(batch.tx, batch.rx).mean
-    solved = solved_again(model, planned, batch)
-    edit.apply(planned, model, model.gaussians)
+    solved = solve_readout(model, planned, batch)
+    edit.apply_edit(planned, model, model.gaussians)
     unsolved = (model(batch.tx, batch.rx).mean - before).square().mean().sqrt()
     with torch.no_grad():
         model.emission.weight2.copy_(solved.weight)
@@ -38,6 +38,6 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
 def test_emissions_of_networks_are_not_solved_again(tmp_path):
     file = spectra(tmp_path / "own.npz", rows=60)
     data, fold = loaded(file)
-    method = build(compose(*brief(file, "model.emission.hidden=4")).model).made_for(data)
+    method = build(compose(*brief(file, "model.emission.hidden=4")).model).create_for(data)
     method.fit(data, fold, short(tmp_path, 1))
-    assert solved_again(method.fitted(), None, data.batch(fold.train[:2])) is None
+    assert solve_readout(method.fitted(), None, data.batch(fold.train[:2])) is None

@@ -9,7 +9,7 @@ from known_arrays import array_site, spectra
 from torch import Tensor
 
 from gsparc.data.datasets.rfid import planar_array
-from gsparc.field.frozen import frozen_view, seen_by_array
+from gsparc.field.frozen import freeze_view, gaussian_vectors
 from gsparc.field.response import ArrayResponse, ChannelResponse
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalise_spectrum
@@ -114,26 +114,26 @@ def _splatted(hidden: int = 0, count: int = 30):
 def test_what_the_array_sees_of_each_gaussian_is_what_it_measures_of_its_image():
     """Freezing rendered every Gaussian by itself: 106 s at 62,000 of them, 0.3 s by gradients."""
     model = _splatted()
-    plan, seen = model.freeze(_pose()), seen_by_array(model, _pose())
+    plan, seen = model.freeze(_pose()), gaussian_vectors(model, _pose())
     images = plan.render(torch.eye(30), int(model.gaussians.version))
     alone = model.response.measured(torch.stack([images, torch.zeros_like(images)], 1))
     torch.testing.assert_close(seen, alone, atol=1e-6 * float(alone.abs().max()), rtol=1e-4)
     with torch.inference_mode():  # as Trainer.test asks
-        torch.testing.assert_close(seen_by_array(model, _pose()), seen)
+        torch.testing.assert_close(gaussian_vectors(model, _pose()), seen)
 
 
 @pytest.mark.slow
 def test_many_gaussians_are_frozen_in_seconds():
     model = _splatted(count=20_000)
     begin = time.perf_counter()
-    assert seen_by_array(model, _pose()).shape == (20_000, 4)
+    assert gaussian_vectors(model, _pose()).shape == (20_000, 4)
     assert time.perf_counter() - begin < 5
 
 
 @pytest.mark.parametrize("hidden", [0, 4])
 def test_the_small_matrix_says_what_compositing_says(hidden):
     model, tx = _splatted(hidden), torch.rand(5, 3)
-    frozen = frozen_view(model, _pose())
+    frozen = freeze_view(model, _pose())
     assert frozen.view.shape == (30, 4) and (frozen.weights is None) == bool(hidden)
     got = frozen.render(model, tx, _pose()).mean
     torch.testing.assert_close(got, model(tx, _pose()).mean.detach(), atol=1e-4, rtol=1e-3)

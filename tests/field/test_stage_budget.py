@@ -9,7 +9,7 @@ from clocks import wound
 from contexts import loaded, short
 
 from gsparc.commands.train import train
-from gsparc.field.stage_budget import Budget
+from gsparc.field.stage_budget import StageBudget
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
@@ -22,8 +22,8 @@ def test_validations_were_not_counted_and_a_resumed_run_has_the_rest(monkeypatch
     clocks = wound(monkeypatch)
     trainer = SimpleNamespace(should_stop=False, state=SimpleNamespace(fn="fit"))
 
-    def watching() -> Budget:
-        return Budget(TimeBudget(40.0, before=Spent(wall=30.0)))  # 30 s went into what came before
+    def watching() -> StageBudget:
+        return StageBudget(TimeBudget(40.0, before=Spent(wall=30.0)))  # 30 s went into what came before
 
     watch = watching()
     watch.on_train_start(trainer, None)
@@ -43,7 +43,7 @@ def test_validations_were_not_counted_and_a_resumed_run_has_the_rest(monkeypatch
 
 def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
     """Fit where preparing a stage takes so long [s], and every step a second by both clocks."""
-    clocks, prepare = wound(monkeypatch), splatting.prepare
+    clocks, prepare = wound(monkeypatch), splatting.initialise
 
     def slow(task):
         clocks.monotonic.wind(wall_s)
@@ -55,10 +55,10 @@ def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
             clocks.monotonic.wind(1.0)
             clocks.process_time.wind(1.0)
 
-    monkeypatch.setattr(splatting, "prepare", slow)
+    monkeypatch.setattr(splatting, "initialise", slow)
     file = spectra(tmp_path / "own.npz")
     data, fold = loaded(file)
-    method = build(compose(*brief(file)).model).made_for(data)
+    method = build(compose(*brief(file)).model).create_for(data)
     callbacks = context.pop("callbacks", lambda: [Ticking()])
     report = method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))
     checkpoint.save(tmp_path / "model.ckpt", method)

@@ -17,7 +17,7 @@ from campaigns import channels, compose, powers, spectra
 from kinds import moving_array, static_array
 
 from gsparc.data.load import load, split_for
-from gsparc.evaluation.experiment.folds import context_of
+from gsparc.evaluation.experiment.folds import fit_context
 from gsparc.models.registry import build
 from gsparc.processes import worker
 from gsparc.training.time_budget import TimeBudget
@@ -98,13 +98,13 @@ def test_every_phase_looks_at_clock_and_interrupt(kind, tmp_path):
     data = make(tmp_path)
     data = data if hasattr(data, "site") else load({"name": "own", "file": str(data)})
     config = compose("dataset=own", "dataset.file=x", f"budget_s={budget_s}", "logger=none", *overrides)
-    method = build(config.model).made_for(data)
+    method = build(config.model).create_for(data)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with watched() as looks:
             method.fit(
-                data, split_for({"name": "random"}, data).folds[0], context_of(config, run_dir=tmp_path)
+                data, split_for({"name": "random"}, data).folds[0], fit_context(config, run_dir=tmp_path)
             )
     finally:
         torch.set_num_threads(threads)

@@ -10,7 +10,7 @@ import numpy as np
 from campaigns import compose
 from worlds import World, arrays
 
-from gsparc.commands.train import Objects, train
+from gsparc.commands.train import TrainedRun, train
 from gsparc.data.schema import Kind, Measurements
 from gsparc.evaluation.baselines import baselines_for, fit_baseline
 from gsparc.evaluation.scores import score_methods
@@ -63,7 +63,9 @@ class Outcome:
         return json.dumps(asdict(self))
 
 
-def run(world: World, seed: int, folder: Path, more: tuple[str, ...] = ()) -> tuple[Outcome, Objects | None]:
+def run(
+    world: World, seed: int, folder: Path, more: tuple[str, ...] = ()
+) -> tuple[Outcome, TrainedRun | None]:
     """Train and judge; files go to `folder`, `more` overrides."""
     folder.mkdir(parents=True, exist_ok=True)
     file, started = folder / "own.npz", time.perf_counter()

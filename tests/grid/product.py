@@ -13,7 +13,7 @@ import gsparc
 from gsparc.commands.check import check
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.train import Objects, train
+from gsparc.commands.train import TrainedRun, train
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.models import loading
@@ -22,12 +22,12 @@ FAR_M = 1e3  # from all that was measured
 SURE_FAR = 0.3  # confidence there, at most
 
 
-def checked(world: World, folder: Path, objects: Objects) -> None:
+def checked(world: World, folder: Path, objects: TrainedRun) -> None:
     """`gsparc check` finds the file good."""
     assert check(str(folder / "own.npz"), Console(quiet=True)), "check"
 
 
-def reloaded(world: World, folder: Path, objects: Objects) -> None:
+def reloaded(world: World, folder: Path, objects: TrainedRun) -> None:
     """The checkpoint answers as the model that was trained."""
     method, _ = loading.load(folder / "run" / "model.ckpt")
     batch = objects.data.batch(objects.split.folds[0].test[:16])
@@ -38,7 +38,7 @@ def reloaded(world: World, folder: Path, objects: Objects) -> None:
         assert torch.allclose(after.confidence, before.confidence, atol=1e-3), "reload: other confidence"
 
 
-def predicted(world: World, folder: Path, objects: Objects) -> None:
+def predicted(world: World, folder: Path, objects: TrainedRun) -> None:
     """Predictions at places in the world's coordinates are finite, and unsure far away."""
     data, rows = objects.data, objects.split.folds[0].train[:8]
     predictor = gsparc.load(folder / "run" / "model.ckpt")
@@ -52,7 +52,7 @@ def predicted(world: World, folder: Path, objects: Objects) -> None:
     assert sure[1] <= max(SURE_FAR, 0.5 * sure[0]) and sure[1] <= sure[0], f"confidence near, far: {sure}"
 
 
-def evaluated(world: World, folder: Path, objects: Objects) -> None:
+def evaluated(world: World, folder: Path, objects: TrainedRun) -> None:
     """`gsparc evaluate` finds the figure that training did."""
     figure = f"test/{DECIDING[objects.data.site.kind]}"
     again = evaluate_files([folder / "run" / "model.ckpt"], {"file": str(folder / "own.npz")})[0].facts
@@ -62,7 +62,7 @@ def evaluated(world: World, folder: Path, objects: Objects) -> None:
     )
 
 
-def drawn(world: World, folder: Path, objects: Objects) -> None:
+def drawn(world: World, folder: Path, objects: TrainedRun) -> None:
     """A map of powers without promise, a page of the rest."""
     ckpt = f"ckpt='{folder / 'run' / 'model.ckpt'}'"
     if world.kind == "power" and world.moving != "both":
@@ -73,7 +73,7 @@ def drawn(world: World, folder: Path, objects: Objects) -> None:
     assert answer.status == 0, answer.err[-1:]
 
 
-def resumed(world: World, folder: Path, objects: Objects) -> None:
+def resumed(world: World, folder: Path, objects: TrainedRun) -> None:
     """Trained again from the run's last state, where it has one, it ends with about the same figure."""
     last = folder / "run" / "last.ckpt"
     if not last.exists():

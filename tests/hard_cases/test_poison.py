@@ -89,7 +89,7 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(tmp_path):
     target = data.target.astype(np.float32).copy()
     bad = int(fold.train[4])
     target[bad, 3, 3] = np.nan
-    method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model).made_for(data)
+    method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model).create_for(data)
     settings = method.settings
     encoding = dataclasses.replace(settings.emission.encoding, kind="raw")
     emission = dataclasses.replace(settings.emission, encoding=encoding)

@@ -10,7 +10,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.closed_form import ClosedForm, restored, stored
+from gsparc.models.closed_form import ClosedForm, method_from_state, method_state
 from gsparc.training.context import FitContext
 
 Form = TypeVar("Form", bound=ClosedForm)
@@ -35,7 +35,7 @@ def conditioned(prior: ChannelPrior, data: Measurements, rows: np.ndarray) -> Ch
 def read_back(method: Form) -> Form:
     """What is read from a file of its stored state."""
     file = io.BytesIO()
-    torch.save(stored(method), file)
+    torch.save(method_state(method), file)
     file.seek(0)
     assert method.site is not None
-    return restored(method.site, torch.load(file, weights_only=True))
+    return method_from_state(method.site, torch.load(file, weights_only=True))

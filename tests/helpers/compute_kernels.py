@@ -10,10 +10,10 @@ from torch import Tensor
 
 from gsparc.field.losses import _Kernel, _written_out
 from gsparc.ops import _native, backends
-from gsparc.ops.channels import channels, summed
-from gsparc.ops.networks import networks, products
+from gsparc.ops.channels import channels, plain_channels
+from gsparc.ops.networks import networks, plain_networks
 
-backends.named("cpu")  # the operators find its kernels
+backends.backend_named("cpu")  # the operators find its kernels
 TONES = (2.4e9, 312_500.0)
 SETS = pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
 
@@ -73,14 +73,14 @@ def band(shape: tuple[int, ...], *inputs: Tensor) -> Tensor:
 
 KINDS = {
     "networks": Kind(
-        lambda shape, *tensors: networks(*tensors), lambda shape, *tensors: products(*tensors), layers,
+        lambda shape, *tensors: networks(*tensors), lambda shape, *tensors: plain_networks(*tensors), layers,
         slice(1, None),
         ((1, 5, 3, 16, 2), (7, 70, 4, 16, 1), (3, 9, 6, 21, 2), (5, 2, 30, 32, 3), (2, 0, 3, 4, 1),
          (0, 3, 2, 5, 1), (5, 9, 33, 40, 1), (37, 9, 256, 32, 4)),
         {torch.float64: (1e-12, 1e-12), torch.float32: (2e-5, 2e-5)},
     ),
     "channels": Kind(
-        band, lambda shape, *inputs: summed(*inputs, TONES, shape[-1]), sources, slice(None),
+        band, lambda shape, *inputs: plain_channels(*inputs, TONES, shape[-1]), sources, slice(None),
         ((1, 37, 4, 26), (3, 5, 1, 1), (2, 18, 3, 70), (2, 0, 2, 3)),
         {torch.float64: (1e-9, 1e-9), torch.float32: (1e-5, 1e-5)},
     ),

@@ -46,6 +46,6 @@ def trained(
 ) -> tuple[Method, Measurements]:
     """The splatted field of `brief`, after so many steps on a user's file; `more` is for `short`."""
     data, fold = loaded(file)
-    method = build(compose(*brief(file, "model.refit=false", *overrides)).model).made_for(data)
+    method = build(compose(*brief(file, "model.refit=false", *overrides)).model).create_for(data)
     method.fit(data, fold, short(folder, steps, **more))
     return method, data

@@ -22,7 +22,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.gradient_stage import DEFAULTS, run_stage
+from gsparc.field.gradient_stage import DEFAULTS, interruptible, make_trainer
 from gsparc.field.module import GaussianModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose
@@ -98,15 +98,17 @@ def trained(
     fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
     shown = (Doubles if double else Loaded)(data, BATCH)
     last = Checkpoint(7)
-    trainer = partial(
+    options = partial(
         DEFAULTS, max_steps=steps, devices=devices, strategy="ddp_fork" if devices > 1 else "auto"
     )
     context = FitContext(
-        folder, batch_size=BATCH, datamodule=shown, trainer=trainer, resume=resume,
+        folder, batch_size=BATCH, datamodule=shown, trainer=options, resume=resume,
         callbacks=lambda: [*densifying(), last, *more],
     )  # fmt: skip
     budget = TimeBudget()
-    budget.pause()
     L.seed_everything(0, verbose=False)
-    run_stage(made.double() if double else made, data, fold, context, TorchCheckpointIO(), budget)
+    trained = made.double() if double else made
+    trainer, batches = make_trainer(trained, data, fold, context, TorchCheckpointIO(), budget)
+    with interruptible(trainer, batches):
+        trainer.fit(trained, datamodule=batches, ckpt_path=resume, weights_only=True)
     return made

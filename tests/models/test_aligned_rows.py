@@ -11,7 +11,7 @@ from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.models import aligned_rows, fitting
-from gsparc.models.aligned_rows import align, with_common_phase
+from gsparc.models.aligned_rows import align_phases, align_rows
 from gsparc.models.gsparc import Gsparc
 from gsparc.physics import row_factors
 from gsparc.physics.row_factors import alignment_factors
@@ -30,21 +30,21 @@ def logged():
 
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
     fold = packets.shares(logged, 0)
-    turned, _ = with_common_phase(logged, fold)
+    turned, _ = align_phases(logged, fold)
     assert turned.site.phase_reference == "neighbours" and turned.site.freedom == "phase+delay"
     assert (turned.target[fold.test] == logged.target[fold.test]).all()
     assert np.allclose(np.abs(turned.target), np.abs(logged.target), rtol=1e-4)
     other = np.array(logged.target)
     other[fold.test] = 0
-    again, _ = with_common_phase(replace(logged, target=other), fold)
+    again, _ = align_phases(replace(logged, target=other), fold)
     assert (again.target[fold.train] == turned.target[fold.train]).all()
-    assert with_common_phase(turned, fold)[0] is turned
+    assert align_phases(turned, fold)[0] is turned
 
 
 def test_rows_that_are_coherent_stay_as_they_are():
     data = packets.measurements(*packets.robot())
     assert set_freedom(data, "auto") is data
-    assert with_common_phase(data, packets.shares(data, 0))[0] is data
+    assert align_phases(data, packets.shares(data, 0))[0] is data
 
 
 def test_antennas_at_known_places_bring_the_carriers_phase_back():
@@ -61,7 +61,7 @@ def test_antennas_at_known_places_bring_the_carriers_phase_back():
         np.arange(150), np.arange(150), np.zeros(150, int), np.zeros(1, int), places,
         (channel * phase[:, None])[..., None], np.zeros(1), np.zeros(150, int),
     )  # fmt: skip
-    found = align(rows, "phase", site)
+    found = align_rows(rows, "phase", site)
     left = found.factors[:, 0] * phase
     assert found.phase_reference == "carrier" and abs(left.mean()) > 0.95
 
@@ -74,7 +74,7 @@ def _site():
 def test_a_free_gain_is_a_unit_row(logged):
     free = replace(logged, site=replace(logged.site, freedom="phase+delay+gain"))
     fold = packets.shares(free, 0)
-    target = with_common_phase(free, fold)[0].target[fold.train]
+    target = align_phases(free, fold)[0].target[fold.train]
     assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(np.abs(free.target[fold.train]).mean((1, 2)))
     told = alignment_factors(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
     assert np.allclose(np.abs(told), 2, rtol=1e-3)
@@ -82,10 +82,10 @@ def test_a_free_gain_is_a_unit_row(logged):
 
 def test_rows_in_parts_are_turned_as_all_at_once(logged, monkeypatch):
     """Ten thousand rows of 64 tones before four antennas took 8 GB."""
-    whole = align(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    whole = align_rows(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
     monkeypatch.setattr(aligned_rows, "AT_ONCE", 64)
     monkeypatch.setattr(row_factors, "AT_ONCE", 64)
-    again = align(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    again = align_rows(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
     assert np.allclose(again.factors, whole.factors)
 
 
@@ -104,7 +104,7 @@ def test_stations_that_are_missing_took_the_places_of_others():
 
 def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
     fold = packets.shares(logged, 0)
-    method, _ = fitting.fit(Gsparc(position_std=0.001), logged, fold, FitContext())
+    method, _ = fitting.fit_or_resume(Gsparc(position_std=0.001), logged, fold, FitContext())
     assert "position_std is not used" in caplog.text and method.made.startswith("aligned")
 
 
@@ -123,7 +123,7 @@ def test_packets_of_one_place_are_averaged(logged):
     packet = (own + level * draw.normal(size=shape) @ [1, 1j]) * np.exp(2j * np.pi * phase)[:, None]
     several = replace(logged.subset(row, logged.site), target=packet.astype(np.complex64))
     fold = packets.shares(several, 0, side=0.1)
-    turned, rows = with_common_phase(several, fold)
+    turned, rows = align_phases(several, fold)
     assert len(rows.train) == len(np.unique(row[fold.train])) and (rows.test == fold.test).all()
     mean, own = turned.target[rows.train], own[rows.train]
     missed = own - mean * alignment_factors(mean, own, tones, "phase+delay")[:, None]
@@ -132,7 +132,7 @@ def test_packets_of_one_place_are_averaged(logged):
 
 def test_one_row_of_a_station_has_nothing_to_be_turned_to(logged):
     """The nearest others of a row alone were an IndexError."""
-    found = align(Snapshots.of(logged, np.arange(1)), "phase+delay", logged.site)
+    found = align_rows(Snapshots.of(logged, np.arange(1)), "phase+delay", logged.site)
     assert found.factors.shape == (1, logged.target.shape[2]) and (found.factors == 1).all()
 
 
@@ -141,6 +141,6 @@ def test_what_any_packet_of_a_place_measured_is_known_of_their_mean(logged):
     mask = np.ones(several.target.shape, bool)
     mask[0, 0, 3] = mask[2, 0, 5] = False
     noise = np.full(3, 0.2, np.float32)
-    rows, mean = aligned_rows.averaged(replace(several, mask=mask, noise_variance=noise), np.arange(3))
+    rows, mean = aligned_rows.average_packets(replace(several, mask=mask, noise_variance=noise), np.arange(3))
     assert rows.tolist() == [0, 2] and mean.mask[0].all() and not mean.mask[2, 0, 5]
     assert mean.noise_variance[rows].tolist() == pytest.approx([0.1, 0.2])

@@ -14,7 +14,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.powers.settings import fit_powers
 from gsparc.models.registry import build
-from gsparc.models.target_rows import heard, left_out_note
+from gsparc.models.target_rows import heard_rows, unheard_note
 from gsparc.processes.powers import Rows
 from gsparc.training.context import FitContext
 
@@ -67,7 +67,7 @@ def test_silent_rows_tell_of_a_half_silent_town(model, margin):
         data, true, _ = town(seed=seed)
         fold, everywhere = fold_of(data), np.arange(len(data))
         told, deviation, _ = predicted(model, data, fold.train, everywhere)
-        untold = predicted(model, data, heard(data, fold.train), everywhere)[0]
+        untold = predicted(model, data, heard_rows(data, fold.train), everywhere)[0]
         error = [float(np.sqrt(((one - true) ** 2).mean())) for one in (told, untold)]
         ratios.append(error[0] / error[1])
         new = fold.test
@@ -119,7 +119,7 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     assert notes == (f"{silent.sum()} rows where nothing was heard are not learned from",)
     assert found.size() == (~silent).sum()
     again = build({"_target_": model})
-    assert not again.fit(data, Fold(heard(data, rows), rows[:0], asked), FitContext()).notes
+    assert not again.fit(data, Fold(heard_rows(data, rows), rows[:0], asked), FitContext()).notes
     batch = data.batch(asked)
     assert torch.equal(found.predict(batch).mean, again.predict(batch).mean)
 
@@ -127,7 +127,9 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
 def test_without_censoring_all_rows_were_heard():
     data, _, _ = town(20)
     plain = replace(data, censored=None, mask=None)
-    assert np.array_equal(heard(plain, np.array([3, 1])), [3, 1]) and not left_out_note(plain, np.arange(3))
+    assert np.array_equal(heard_rows(plain, np.array([3, 1])), [3, 1]) and not unheard_note(
+        plain, np.arange(3)
+    )
 
 
 def test_nothing_heard_at_all_is_finite():

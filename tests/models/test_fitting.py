@@ -13,7 +13,7 @@ from scenes import fold_of
 from gsparc.data import executor
 from gsparc.models import checkpoint, fitting
 from gsparc.models.baselines.nearest import Nearest
-from gsparc.models.per_station import PerStation, of_station
+from gsparc.models.per_station import PerStation, station_site
 from gsparc.training.context import FitContext
 
 
@@ -63,14 +63,16 @@ def test_a_folder_of_stations_that_were_finished_was_not_gone_on_from(town, tmp_
     """Of a run's folder only its own `last.ckpt` was taken, which stations have in folders of their own."""
     fitted(town, tmp_path / "run")
     Resumable.fits = 0
-    fitting.fit(PerStation(Resumable()), *town, FitContext(tmp_path / "on", resume=tmp_path / "run"))
+    fitting.fit_or_resume(
+        PerStation(Resumable()), *town, FitContext(tmp_path / "on", resume=tmp_path / "run")
+    )
     assert Resumable.fits == 0
 
 
 def test_a_part_is_not_taken_for_another(town, tmp_path):
     data = town[0]
     fitted(town, tmp_path / "run")
-    one, two = (data.subset(np.flatnonzero(data.station == t), of_station(data.site, t)) for t in (0, 1))
+    one, two = (data.subset(np.flatnonzero(data.station == t), station_site(data.site, t)) for t in (0, 1))
     assert one.site.sha256 != two.site.sha256 != data.site.sha256
     (tmp_path / "run" / "station1" / "model.ckpt").rename(tmp_path / "run" / "station0" / "model.ckpt")
     with pytest.raises(ValueError, match="was trained with other data"):
@@ -92,9 +94,9 @@ def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
     checkpoint.save(
-        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.marks(report, data, fold, context)
+        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.checkpoint_marks(report, data, fold, context)
     )
-    again, found = fitting.fit(
+    again, found = fitting.fit_or_resume(
         PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")
     )
     assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
@@ -119,7 +121,7 @@ def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
 def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
     (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
     (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
-    assert fitting.folder_of(tmp_path / given, fitting.FOLDS) == tmp_path / found
+    assert fitting.run_folder(tmp_path / given, fitting.FOLDS) == tmp_path / found
 
 
 @pytest.mark.parametrize(

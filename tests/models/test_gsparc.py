@@ -28,7 +28,7 @@ from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import Powers
-from gsparc.models.per_station import PerStation, for_stations
+from gsparc.models.per_station import PerStation, by_station
 from gsparc.models.registry import build, method_class
 from gsparc.models.splat.image_process import ImageProcess
 from gsparc.ops import Pose
@@ -84,7 +84,7 @@ def fit(
     try:
         context = short(folder, steps, validate_every=4, budget_s=seconds, budget_clock="processor", **more)
         began = time.process_time()
-        method, report = fitting.fit(for_stations(build(config.model), data), data, fold, context)
+        method, report = fitting.fit_or_resume(by_station(build(config.model), data), data, fold, context)
         spent = (time.process_time() - began) / torch.get_num_threads()
     finally:
         logger.removeHandler(kept)
@@ -215,7 +215,8 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    monkeypatch.setattr(solution_weights, "weights", lambda found, *unused: (1 / len(found),) * len(found))
+    equal = lambda found, *unused: (1 / len(found),) * len(found)  # noqa: E731
+    monkeypatch.setattr(solution_weights, "stacking_weights", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
@@ -316,7 +317,7 @@ def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
     data = KINDS["powers"](tmp_path)
     fold = fold_of(data)
     with pytest.raises(ZeroDivisionError):
-        fitting.fit(Gsparc(), data, fold, short(tmp_path, 10, budget_s=5.0))
+        fitting.fit_or_resume(Gsparc(), data, fold, short(tmp_path, 10, budget_s=5.0))
     assert len(given) == 1 and 4 < given[0] < 5
 
 
@@ -324,4 +325,4 @@ def test_weights_to_start_from_were_ignored_in_closed_form(tmp_path):
     data = KINDS["powers"](tmp_path)
     context = FitContext(init_from=tmp_path / "model.ckpt")
     with pytest.raises(ValueError, match="init_from: gsparc takes no weights to start from here"):
-        fitting.fit(Gsparc(), data, fold_of(data), context)
+        fitting.fit_or_resume(Gsparc(), data, fold_of(data), context)

@@ -18,11 +18,11 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import baselines_for
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.experiment.folds import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint, loading
-from gsparc.models.fitting import fit
-from gsparc.models.per_station import PerStation, for_stations, of_station, trained_stations
+from gsparc.models.fitting import fit_or_resume
+from gsparc.models.per_station import PerStation, by_station, station_site, trained_stations
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
@@ -35,7 +35,7 @@ def town():
 
 
 def fitted(name, data, fold, folder=Path()):
-    method = for_stations(method_class(name)(), data)
+    method = by_station(method_class(name)(), data)
     method.fit(data, fold, FitContext(folder))
     return method
 
@@ -51,7 +51,7 @@ def test_every_station_has_its_own(town, fold, tmp_path):
     found = method.predict(town.batch(fold.test)).mean[:, 0]
     for number in range(len(POSTS)):
         rows = fold.test[town.station[fold.test] == number]
-        alone = town.subset(np.flatnonzero(town.station == number), of_station(town.site, number))
+        alone = town.subset(np.flatnonzero(town.station == number), station_site(town.site, number))
         assert alone.site.static_position is not None
         assert len(found[town.station[fold.test] == number].unique()) == 1, rows
     decibels = 10 * torch.log10(found)
@@ -87,7 +87,7 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
 
 def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(town, tmp_path):
     split = split_for({"name": "stations"}, town)
-    contexts = in_folders(FitContext(tmp_path), split)
+    contexts = fold_contexts(FitContext(tmp_path), split)
     fits = fit_folds(method_class("mean")(), town, split, contexts)
     found = evaluate(
         fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
@@ -97,12 +97,12 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
     assert found["test/rmse_db"] > max(10, 2 * found["test/rmse_db_after_constant"])
     gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
     with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
-        fit_folds(gsparc_like(), town, split, contexts).scored_on(town, split)
+        fit_folds(gsparc_like(), town, split, contexts).with_scores(town, split)
 
 
 def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
-    method = for_stations(method_class("mean")(), town)
+    method = by_station(method_class("mean")(), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
     assert len(dict(method)) == 1 and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
     with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
@@ -112,9 +112,9 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
 def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     walk = walked(40)
     data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})
-    assert for_stations(method_class("idw")(), data).both_ends
+    assert by_station(method_class("idw")(), data).both_ends
     with pytest.raises(ValueError, match="both ends move here"):
-        for_stations(method_class("array")(), data)
+        by_station(method_class("array")(), data)
 
 
 def test_a_station_that_heard_nothing_ended_the_run():
@@ -131,7 +131,7 @@ def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
     for name in ("gsparc", "powers", "gp"):
         assert trained_stations(method_class(name)(), data, fold_of(data))[0].all()
     context = FitContext(stations="each", effort=0.1)
-    method, _ = fit(for_stations(method_class("gsparc")(), data), data, fold_of(data), context)
+    method, _ = fit_or_resume(by_station(method_class("gsparc")(), data), data, fold_of(data), context)
     assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()
 
 
@@ -154,7 +154,7 @@ def test_the_place_of_a_single_station_was_sought():
     for end in ("tx", "rx"):
         data = heard(posts=POSTS[1:2], end=end)
         np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
-        fold, method = fold_of(data), for_stations(method_class("distance_law")(), data)
+        fold, method = fold_of(data), by_station(method_class("distance_law")(), data)
         notes = method.fit(data, fold, FitContext()).notes
         assert len(notes) == 1 and "exponent 2" in notes[0]
         assert data.batch(fold.test).rx.batched == (end == "rx")
@@ -191,8 +191,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 
 
 def test_seconds_of_stations_were_said_to_be_unused(town):
-    assert for_stations(method_class("gsparc")(), town).takes_budget
-    assert not for_stations(method_class("idw")(), town).takes_budget
+    assert by_station(method_class("gsparc")(), town).takes_budget
+    assert not by_station(method_class("idw")(), town).takes_budget
 
 
 def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
@@ -205,7 +205,7 @@ def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path
             return super().fit(data, fold, context)
 
     for context in (FitContext(), FitContext(tmp_path)):
-        for_stations(Writes(), town).fit(town, fold, context)
+        by_station(Writes(), town).fit(town, fold, context)
     assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
 
 

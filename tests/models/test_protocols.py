@@ -30,10 +30,10 @@ from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import method as protocols
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, MethodFactory, suited_threads
+from gsparc.models.method import Method, MethodFactory, suitable_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.models.registry import build, method_class, methods
 from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
@@ -127,7 +127,7 @@ def unfitted(name: str) -> MethodFactory:
 def fitted(name: str) -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
         data = data_of(name, Path(folder))
-        method = unfitted(name).made_for(data)
+        method = unfitted(name).create_for(data)
         fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
     return method, data, fold
@@ -154,7 +154,7 @@ def ends(method: Method, moving: torch.Tensor) -> Query:
 
 @pytest.mark.parametrize("name", methods())
 def test_a_method_is_what_the_table_says(name, tmp_path):
-    method = method_class(name)().made_for(data_of(name, tmp_path))
+    method = method_class(name)().create_for(data_of(name, tmp_path))
     kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
     assert kept_to == set(DECLARED[name].split())
     assert method.resumable == (name in (*PEERS, "fire", "splat", "gsparc", *NAMED))
@@ -190,10 +190,10 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
 )
 def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     method, data, fold = fitted(name)
-    assert set(settings) <= set(method.knobs())
+    assert set(settings) <= set(method.reduction_settings())
     query = ends(method, places(method).float())
     before = method.predict(query)
-    less = method.reduced(settings, method.contributions(data, fold.train))
+    less = method.reduced(settings, method.reduction_inputs(data, fold.train))
     assert not torch.equal(less.predict(query).mean, before.mean)
     after = method.predict(query)
     for part in ("mean", "confidence", "variance"):
@@ -207,7 +207,7 @@ def test_threads_of_a_query(monkeypatch, name, places, inside):
     threads = [2]
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
     monkeypatch.setattr(torch, "set_num_threads", threads.append)
-    with pytest.raises(ZeroDivisionError), suited_threads(method_class(name)(), places):
+    with pytest.raises(ZeroDivisionError), suitable_threads(method_class(name)(), places):
         assert torch.get_num_threads() == inside
         raise ZeroDivisionError
     assert torch.get_num_threads() == 2  # also after an error
@@ -239,7 +239,7 @@ def test_what_is_scored_is_what_is_served(name):
 def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     data = kinds.several(tmp_path)
     fold = fold_of(data)
-    method = for_stations(method_class(name)(), data)
+    method = by_station(method_class(name)(), data)
     method.fit(data, fold, FitContext(tmp_path, stations=how))
     predictor = Predictor(method, data.site)
     for number in range(len(kinds.POSTS)):
@@ -251,7 +251,7 @@ def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
 @pytest.mark.parametrize("words", ["model=complex_gp", "model=gsparc model.effects.phase=false"])
 def test_places_are_served_in_the_phase_of_the_largest_run(words):
     data = from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0))
-    fold, method = fold_of(data), build(compose(*words.split()).model).made_for(data)
+    fold, method = fold_of(data), build(compose(*words.split()).model).create_for(data)
     method.fit(data, fold, FitContext())
     batch = data.batch(fold.test)
     factor = method.runs.of(batch.run)[:, None, None]

@@ -18,8 +18,8 @@ from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import for_stations
-from gsparc.models.refined_places import Linearised, displaced, displacements, refined
+from gsparc.models.per_station import by_station
+from gsparc.models.refined_places import Linearised, displacements, move_rows, refine_places
 from gsparc.training.context import FitContext
 
 BRIEF = FitContext(effort=0.1)
@@ -84,7 +84,7 @@ def _channels(error_m, rows=130, seed=0):
     arrays = {"rx_position": place, "tx_position": np.array([3.0, 1, 2]), "csi": csi[:, :, None]}
     exact = from_arrays({**arrays, "frequency_hz": np.array([CARRIER])})
     known = np.arange(90)
-    moved = displaced(exact, known, error_m * rng.normal(size=(90, 3)))
+    moved = move_rows(exact, known, error_m * rng.normal(size=(90, 3)))
     return exact, moved, Fold(known[:80], known[80:], np.arange(90, rows))
 
 
@@ -96,7 +96,7 @@ def _missed(method, exact, fold):
 
 
 def _fitted(data, fold, **settings):
-    return fitting.fit(Gsparc(**settings), data, fold, BRIEF)
+    return fitting.fit_or_resume(Gsparc(**settings), data, fold, BRIEF)
 
 
 def test_known_errors_of_places_cost_less_than_unknown_ones():
@@ -126,14 +126,14 @@ def test_exact_places_stay_though_errors_are_claimed():
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
-    _, report = fitting.fit(for_stations(Gsparc(position_std=0.05), data), data, fold, BRIEF)
+    _, report = fitting.fit_or_resume(by_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
     assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
 
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
     data = KINDS["images"](tmp_path)
     with caplog.at_level(logging.WARNING):
-        Gsparc(position_std=0.05, steps=0).made_for(data)
+        Gsparc(position_std=0.05, steps=0).create_for(data)
     assert "position_std is not used" in caplog.text
 
 
@@ -148,8 +148,8 @@ def test_places_come_nearer_to_the_truth_in_techtile():
     data = Techtile(real("real/techtile-csi-920mhz.npz"), stations=[0], runs=["EXP005"]).load()
     rows = np.arange(0, len(data), 4)
     error = np.random.default_rng(0).normal(scale=0.03, size=(len(rows), 3))
-    moved = displaced(data, rows, error)
+    moved = move_rows(data, rows, error)
     method, _ = _fitted(moved, Fold(rows[:-20], rows[-20:], rows[:0]))
-    found, by, said = refined(method, moved, np.full(len(data), 0.03))
+    found, by, said = refine_places(method, moved, np.full(len(data), 0.03))
     assert np.array_equal(np.sort(found), rows) and "refined by" in said
     assert np.square(error + by)[:, :2].mean() < 0.9 * np.square(error)[:, :2].mean()

@@ -137,7 +137,7 @@ UPLINK = ("ridge", "fire", "uplink")
 def trained(name, data, fold, folder):
     """Test predictions after half a second of training."""
     config = compose(f"model={name}", "budget_s=0.5", *(["model.max_steps=20"] if name == "fire" else []))
-    method = build(config.model).made_for(data)
+    method = build(config.model).create_for(data)
     method.fit(data, fold, short(folder, 4, budget_s=0.5))
     return method.predict(data.batch(fold.test)).mean
 

@@ -5,7 +5,7 @@ import torch
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
-from gsparc.ops.queries import array_spectrum, nearest_weights, served
+from gsparc.ops.queries import array_spectrum, has_query_kernel, nearest_weights
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.features import correlation, parts_of
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
@@ -64,7 +64,7 @@ def test_rows_without_a_factor_are_said():
 
 
 def test_followed_tensors_are_left_to_autograd():
-    assert served(torch.ones(2))
-    assert not served(torch.ones(2, requires_grad=True))
+    assert has_query_kernel(torch.ones(2))
+    assert not has_query_kernel(torch.ones(2, requires_grad=True))
     with torch.no_grad():
-        assert served(torch.ones(2, requires_grad=True))
+        assert has_query_kernel(torch.ones(2, requires_grad=True))

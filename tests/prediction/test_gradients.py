@@ -30,7 +30,7 @@ from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -163,7 +163,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             for module in (gp, complex_gp, powers):
                 patch.setattr(module, "MOST_ROWS", 30)
             patch.setattr(complex_gp, "NEAREST", 20)
-        method = for_stations(case.make(), data).made_for(data)
+        method = by_station(case.make(), data).create_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
         budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))
@@ -319,7 +319,7 @@ def test_models_without_gradients_say_so(name, tmp_path):
     rendered = name == "gsparc"  # of a moving receiver
     data = images(tmp_path, 40, "rx") if rendered else kinds.received(tmp_path)
     more = (*RENDERED, "model.field.count=10", "model.keep_best=false")
-    method = (planned(*more) if rendered else method_class(name))().made_for(data)
+    method = (planned(*more) if rendered else method_class(name))().create_for(data)
     method.fit(data, make_split(data.moving, SplitSettings()).folds[0], short(tmp_path, 2))
     with pytest.raises(ValueError, match=f"{name} has no gradients by position: .*{REFUSED[name]}"):
         getattr(Predictor(method, data.site), data.site.kind)(rx=torch.zeros(3), grad=True)

@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsparc.commands.train import main
 from gsparc.field.optimizer import OptimizerSettings
-from gsparc.training.tracking import Part, log_picture, log_table, tensorboard_logger, wandb_logger
+from gsparc.training.tracking import PartLogger, log_picture, log_table, tensorboard_logger, wandb_logger
 
 BLOCK, HEAD, START = 32768, 7, 7  # bytes
 
@@ -129,7 +129,7 @@ def test_other_loggers_are_left_alone(file):
 def test_a_part_has_pictures_and_figures_under_its_name(file):
     logger = Records()
     logger.log_metrics = lambda figures, step: logger.said.append((figures, step))
-    part = Part(Part(logger, "fold1"), "refit")
+    part = PartLogger(PartLogger(logger, "fold1"), "refit")
     part.log_metrics({"train/loss": 0.5}, 9)
     log_picture([part], "predictions", file, 7)
     assert logger.said == [({"fold1/refit/train/loss": 0.5}, 9), ("fold1/refit/predictions", [str(file)], 7)]

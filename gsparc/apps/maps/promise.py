@@ -17,7 +17,7 @@ from gsparc.data.executor import run_each
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models.method import Method, predictions
+from gsparc.models.method import Method, predict_in_batches
 from gsparc.prediction.predictor import keep
 from gsparc.prediction.refit import Learned
 
@@ -147,7 +147,7 @@ def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
     mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    for chosen, _, said in predictions(method, data, rows, CHUNK):
+    for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
     return mean, spread
 

@@ -101,7 +101,7 @@ def _show_whole(main: Callable[[], object]) -> None:
     config = DictConfig(OmegaConf.create(said.getvalue()))
     node = config if "_target_" in config else config.get("model")  # the former with `--package model`
     if isinstance(node, DictConfig):
-        registry.complete(node)
+        registry.fill_defaults(node)
     sys.stdout.write(OmegaConf.to_yaml(config))
 
 
@@ -184,7 +184,7 @@ def help_text(answers: str, config: str) -> str:
 
 def _complete(config: DictConfig) -> None:
     """Add the settings of a model that its file leaves to its class, also to what Hydra has written."""
-    registry.complete(config.model)
+    registry.fill_defaults(config.model)
     hydra_config = HydraConfig.get()
     if hydra_config.output_subdir is not None:
         OmegaConf.save(

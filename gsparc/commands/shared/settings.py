@@ -17,7 +17,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import plain as plain
-from gsparc.models.registry import known
+from gsparc.models.registry import all_methods
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _accelerators() -> list[str]:
 def _methods(names: Any) -> tuple[str, ...] | None:
     if names is None:
         return None
-    methods = known()
+    methods = all_methods()
     if isinstance(names, list) and all(name in methods for name in names):
         return tuple(names)
     wrong = next((b for b in names if b not in methods), names) if isinstance(names, list) else names

@@ -8,7 +8,8 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
 from importlib.metadata import distribution, packages_distributions
@@ -25,7 +26,7 @@ from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import read_summary, run_git
-from gsparc.models.fitting import LAST, leaves
+from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ class State:
         """Return the state of a resolved configuration, of hashes of measurements and of their split."""
         kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
-        named = {name: value for name, value in leaves(whole) if not (data and name in OF_DATA)}
+        named = {name: value for name, value in dotted_settings(whole) if not (data and name in OF_DATA)}
         files = {name: value for name, value in named.items() if isinstance(value, str)}
         found = {name: _content_of(value) for name, value in files.items() if os.path.isfile(value)}
         if os.path.isdir(root := files.get("dataset.root", "")):
@@ -115,7 +116,6 @@ def run_once(
     state: State,
     work: Callable[[str | None], object],
     *,
-    unread: State | None = None,
     reuse: bool = False,
     again: bool = False,
 ) -> dict[str, Any]:
@@ -124,9 +124,7 @@ def run_once(
     Args:
         folder: the cell's own, held by the caller.
         state: of the cell.
-        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
-            interrupted try has left, None to begin anew.
-        unread: the same state, by which it is found done before its data are read.
+        work: does it, and writes the summary; is given what `recorded` yields.
         reuse: see `read_finished`.
         again: one that is done is done anew.
 
@@ -137,6 +135,26 @@ def run_once(
     if facts is not None:
         log.info("%s: already done", folder)
         return facts
+    with recorded(folder, state) as left:
+        work(left)
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
+
+
+@contextmanager
+def recorded(folder: Path, state: State, unread: State | None = None) -> Iterator[str | None]:
+    """Record when a cell begins, and that it has ended where nothing is raised.
+
+    Args:
+        folder: the cell's own, held by the caller.
+        state: of the cell.
+        unread: the same state, by which it is found done before its data are read.
+
+    Yields:
+        The checkpoint, or folder, of the same state that an interrupted try has left; None to begin anew.
+    """
     record = read_summary(folder / RECORD)
     left = None
     if record is None or record.get("ended") or not state.same(record):
@@ -146,12 +164,8 @@ def run_once(
     else:
         left = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
-    work(left)
+    yield left
     _write(folder / RECORD, {**record, "ended": True})
-    facts = read_summary(folder / SUMMARY)
-    if facts is None:
-        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
-    return facts
 
 
 def program_hash(settings: Any) -> str:

@@ -28,7 +28,7 @@ FREE_S = 5.0  # guessed for a method without a budget
 
 
 @dataclass(frozen=True)
-class Filled:
+class CellResult:
     """A cell with its result.
 
     Attributes:
@@ -57,7 +57,7 @@ class Filled:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedCell:
     """A cell of a problem, composed but not yet trained.
 
     Attributes:
@@ -81,33 +81,33 @@ class Prepared:
         # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
         return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
-    def result(self) -> Filled | None:
+    def result(self) -> CellResult | None:
         """Return the result, if it is done."""
         facts = read_finished(self.folder, self.state, self.reuse)
         return None if facts is None else self.filled(facts)
 
-    def filled(self, facts: dict[str, Any]) -> Filled:
+    def filled(self, facts: dict[str, Any]) -> CellResult:
         """Return the cell with these facts."""
         # The program's hash, not the commit, decides: most commits change nothing that a method computes.
         earlier = "" if facts.get("program") == self.state.program else str(facts.get("git"))[:8]
-        return Filled(self.cell, self.folder, facts, self.problem.draw is not None, earlier)
+        return CellResult(self.cell, self.folder, facts, self.problem.draw is not None, earlier)
 
 
-def prepare(
+def prepare_cell(
     cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, cells_dir: Path,
     reuse: bool = False,
-) -> Prepared:  # fmt: skip
+) -> PreparedCell:  # fmt: skip
     """Compose a cell's configuration and name its folder, `dataset/split/method/budget/seed`."""
     overrides = [*problem.chosen, *contender.overrides(cell.budget_s)]
     config = compose(settings, overrides, problem.draw, cell.seed)
     state = State.of(config, problem.content, problem.folds.sha256)
-    return Prepared(cell, problem, config, cells_dir / str(cell), state, reuse)
+    return PreparedCell(cell, problem, config, cells_dir / str(cell), state, reuse)
 
 
-Run = Callable[[Prepared, str | None], object]
+Run = Callable[[PreparedCell, str | None], object]
 
 
-def _tried(run: Run, one: Prepared) -> Filled | str:
+def _tried(run: Run, one: PreparedCell) -> CellResult | str:
     """The cell, or why it cannot be filled; one failing cell does not stop the table."""
     try:
         return one.filled(run_once(one.folder, one.state, partial(run, one), reuse=one.reuse))
@@ -118,9 +118,9 @@ def _tried(run: Run, one: Prepared) -> Filled | str:
         return error_in_one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
 
 
-def fill_all(
-    prepared: Sequence[Prepared], run: Run, train: bool = True, limit_s: float | None = None
-) -> list[Filled]:
+def run_cells(
+    prepared: Sequence[PreparedCell], run: Run, train: bool = True, limit_s: float | None = None
+) -> list[CellResult]:
     """Find or fill cells, saying how far it is and how long it will take.
 
     A cell that cannot be filled is said and left out; the others go on.
@@ -138,7 +138,7 @@ def fill_all(
     # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 
-    def fits(one: Prepared) -> bool:
+    def fits(one: PreparedCell) -> bool:
         late = limit_s is not None and time.monotonic() - started + one.expected_s > limit_s
         if late:
             log.warning("max_hours: %s is not started", one.cell)

@@ -22,13 +22,13 @@ from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, less_repeatable
 
 
-def context_of(config: DictConfig, **others: Any) -> FitContext:
+def fit_context(config: DictConfig, **others: Any) -> FitContext:
     """Return the context of a fit as a composed configuration says, and what is given.
 
     Args:
@@ -37,17 +37,17 @@ def context_of(config: DictConfig, **others: Any) -> FitContext:
     """
     init_from = config.get("init_from")
     return FitContext(
-        **counted(config),
+        **effort_settings(config),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
         trainer=instantiate(config.trainer, _partial_=True),
-        callbacks=partial(callbacks_of, config.get("callbacks")),
+        callbacks=partial(build_callbacks, config.get("callbacks")),
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
         **others,
     )
 
 
-def counted(config: Mapping[str, Any]) -> dict[str, Any]:
+def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of a context decides how much is searched, and on which rows; it makes no object."""
     split = config.get("split")
     own = split if split is None or isinstance(split, dict) else plain(split)
@@ -59,13 +59,13 @@ def counted(config: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:
+def build_callbacks(nodes: Mapping[str, Any] | None) -> list[Callback]:
     """Every callback of the group `callbacks` that was not set to null."""
     return [instantiate(node) for node in (nodes or {}).values() if node is not None]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FoldFits:
     """A method after it was fitted on every fold.
 
     Attributes:
@@ -86,12 +86,12 @@ class Outcome:
     limited_by: Clock | None = None
     cost: Cost = NO_COST
 
-    def scored_on(self, data: Measurements, split: Split) -> Outcome:
+    def with_scores(self, data: Measurements, split: Split) -> FoldFits:
         """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
         return replace(self, figures=pool_figures(score_methods(self.methods, data, split), data, split))
 
 
-def in_folders(whole: FitContext, split: Split) -> list[FitContext]:
+def fold_contexts(whole: FitContext, split: Split) -> list[FitContext]:
     """Return the contexts of its folds, each with a folder and series of figures of its own."""
     return [whole.within(f"fold{number}") for number in range(len(split.folds))]
 
@@ -104,8 +104,8 @@ def fit_folds(
     *,
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Method, FitReport], None] | None = None,
-) -> Outcome:
-    """Fit an unfitted method on every fold; `Outcome.scored_on` scores them together.
+) -> FoldFits:
+    """Fit an unfitted method on every fold; `Outcome.with_scores` scores them together.
 
     Args:
         factory: an unfitted method, or what chooses one.
@@ -128,7 +128,7 @@ def fit_folds(
         # process_time counts all threads of this process, waiting for others excluded.
         before = time.process_time()
         # Stations are counted in the data that are learned from, which `learned` may have changed.
-        method, report = fitting.fit(for_stations(factory, there), there, rows, contexts[number])
+        method, report = fitting.fit_or_resume(by_station(factory, there), there, rows, contexts[number])
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}
@@ -138,7 +138,7 @@ def fit_folds(
         if keep is not None:
             keep(number, *one[:2])
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
-    return Outcome(
+    return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
         methods, tuple(one.seconds for one in reports), processor, {}, reports[0].notes,
         less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),

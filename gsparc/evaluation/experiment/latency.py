@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models import loading
 from gsparc.models.method import Method
@@ -48,7 +48,7 @@ class Latency:
     rounds: int
 
 
-def time_queries(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
+def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, Latency]:
     """One row per method, from the first of its checkpoints."""
     data, split = problem.data, problem.folds
     methods: dict[str, Method] = {}
@@ -75,7 +75,7 @@ def time_queries(filled: Sequence[Filled], problem: Problem) -> dict[str, Latenc
 
 
 def time_by_dataset(
-    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem]
+    filled: Sequence[CellResult], problems: Mapping[tuple[str, str], Problem]
 ) -> dict[str, dict[str, Latency]]:
     """Return latencies by dataset and method, of the first split that is there and keeps its models."""
     found: dict[str, dict[str, Latency]] = {}

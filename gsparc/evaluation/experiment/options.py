@@ -15,7 +15,7 @@ from gsparc.data.heeded import Option, Reads
 from gsparc.data.instantiate import import_target
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import FileSettings, SplitSettings
-from gsparc.models.fitting import leaves
+from gsparc.models.fitting import dotted_settings
 from gsparc.models.method import Method, MethodFactory
 
 log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ def command_line_options() -> dict[str, str]:
     # Hydra's own grammar: quotes, lists and + or ~ at the head are not to be split by hand.
     for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
         path, value = one.key_or_group, one.value()
-        inner = leaves(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
+        inner = dotted_settings(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
         said |= {name: one.input_line or name for name, _ in inner}
     # A file of the group `init` is as good as its name.
     return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
@@ -101,7 +101,7 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
 
 def _alone(method: Method) -> bool:
     """Whether the process beside the field has all the weight."""
-    return method.field_alone() is not None and not method.size()
+    return method.without_process() is not None and not method.size()
 
 
 def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str:

@@ -21,7 +21,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment.done import measurements_hash
 from gsparc.models.powers.together.network import network_of
-from gsparc.models.registry import complete
+from gsparc.models.registry import fill_defaults
 from gsparc.simulate.scenes.build import names_scene
 
 log = logging.getLogger(__name__)
@@ -157,7 +157,7 @@ def _composed(overrides: tuple[str, ...]) -> DictConfig:
     # Baselines are cells of their own here, and pictures of every cell nobody looks at.
     chosen = ["logger=none", "baselines=[]", "~callbacks.pictures", *overrides]
     config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
-    complete(config.model)
+    fill_defaults(config.model)
     return config
 
 

@@ -17,13 +17,13 @@ from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, run_once
-from gsparc.evaluation.experiment.folds import Outcome, fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
 from gsparc.evaluation.metric_formats import DECIDING
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
-from gsparc.models.refined_places import displaced
+from gsparc.models.refined_places import move_rows
 from gsparc.prediction.timing import (
     ClockSettings,
     cycle_queries,
@@ -176,22 +176,22 @@ class Study:
         """One training per condition that changes what is learned from, scored under all of them."""
         # Each round has another seed, of the draws of errors as well as of the method.
         seed, figure, facts = self.seed + turn, DECIDING[data.site.scored], dict[str, Any]()
-        fits: dict[Condition, Outcome] = {}
+        fits: dict[Condition, FoldFits] = {}
         for condition in self.conditions:
             learned = condition.learned
             if learned not in fits:
-                contexts = in_folders(
+                contexts = fold_contexts(
                     replace(context, run_dir=learned.model(folder).parent, seed=seed), split
                 )
                 learned_from = partial(learned.learned_from, seed=seed)
                 made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
-                fits[learned] = made.scored_on(data, split)
+                fits[learned] = made.with_scores(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
                 # Without the configuration of the study: a variant has other settings.
                 checkpoint.save(learned.model(folder), made.methods[0], "", extra)
             outcome = fits[learned]
             if condition.what == "query":
-                outcome = outcome.scored_on(condition.tested_on(data, split, seed), split)
+                outcome = outcome.with_scores(condition.tested_on(data, split, seed), split)
             folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
@@ -216,7 +216,7 @@ class Study:
         # A method that was only asked elsewhere is the same on the clock: it is timed once.
         # A dictionary by file: conditions that share a training share its model and its time.
         methods = {
-            file: loading.made_again(self.variants[variant](), checkpoint.read(file))
+            file: loading.rebuild_method(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
         times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
@@ -224,7 +224,7 @@ class Study:
         return rows[list(ROW)]
 
 
-def _value(outcome: Outcome, figure: str) -> float:
+def _value(outcome: FoldFits, figure: str) -> float:
     value = outcome.figures[figure]
     if value is None:
         raise ValueError(f"{figure} is not defined on these test rows")
@@ -270,7 +270,7 @@ def add_position_errors(data: Measurements, rows: np.ndarray, error_m: float, se
     # One error a place, or averages over rows of one place would shrink it.
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
-    return displaced(data, rows, offset[first][place.reshape(-1)])
+    return move_rows(data, rows, offset[first][place.reshape(-1)])
 
 
 def add_direction_errors(

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.metric_formats import CALIBRATION, form_of, heading_of
 from gsparc.evaluation.results import score_db
@@ -47,7 +47,7 @@ ROW = [
 ]  # fmt: skip
 
 
-def table_of_cells(filled: Sequence[Filled]) -> pd.DataFrame:
+def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
     """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
     rows = []
     for one in filled:
@@ -66,7 +66,7 @@ def table_of_cells(filled: Sequence[Filled]) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def average_cells(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:

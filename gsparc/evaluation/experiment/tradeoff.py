@@ -23,9 +23,9 @@ from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import rows_to_score, score_methods
 from gsparc.evaluation.table import Column
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Point, Settings, worded
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
+from gsparc.prediction.pareto import Point, Settings, worded
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import Call, ClockSettings, time_interleaved
 
@@ -222,7 +222,7 @@ def facts_of(
 
 def why_irreducible(method: Method) -> list[str]:
     """Return a sentence where there is nothing to weigh against time."""
-    if method.knobs():
+    if method.reduction_settings():
         return []
     why = "it has no Gaussians, sources, components or variances to spare"
     if isinstance(method, PerStation):

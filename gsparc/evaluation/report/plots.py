@@ -19,7 +19,7 @@ from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
-from gsparc.models.pareto import front
+from gsparc.prediction.pareto import front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95

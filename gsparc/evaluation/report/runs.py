@@ -18,7 +18,7 @@ from gsparc.evaluation.baselines import BASELINES
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import result_rows
 from gsparc.evaluation.summary import read_summary, write_samples
-from gsparc.models.fitting import leaves
+from gsparc.models.fitting import dotted_settings
 from gsparc.prediction.timing import BLOCKS, Call, median_and_p95, time_interleaved
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
@@ -169,7 +169,7 @@ def read_run(folder: Path) -> Run:
         facts,
         samples,
         tuple(map(str, _written(folder / ".hydra" / "overrides.yaml"))),
-        dict(leaves(_written(folder / ".hydra" / "config.yaml") or {})),
+        dict(dotted_settings(_written(folder / ".hydra" / "config.yaml") or {})),
         np.zeros(0) if render is None else render,
     )
 

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from gsparc.models.array_vectors.vector_gp import align_along_tree, refine_alignment
-from gsparc.models.left_out_images import LeftOut, mean_log_error, predict_left_out
+from gsparc.models.splat.left_out_images import LeftOut, mean_log_error, predict_left_out
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, SmoothRough
 

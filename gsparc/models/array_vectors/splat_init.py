@@ -18,16 +18,16 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_errors
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Prior
-from gsparc.field.frozen import seen_by_array
+from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached, write_recovery_report
 from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, mirror_elements
-from gsparc.models.left_out_images import LeftOut
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
@@ -132,7 +132,7 @@ def learn_vector_process(
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
-        fit_errors(tuned.unknown, tuned.error),
+        fit_error_law(tuned.unknown, tuned.error),
         tuned.left_out,
         elapsed,
         training,
@@ -144,7 +144,7 @@ def set_emissions(model: GaussianModel, process: VectorProcess, receiver: Pose) 
     """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
     response = model.response
     assert isinstance(response, ArrayResponse)
-    view = seen_by_array(model, receiver)  # (N, M)
+    view = gaussian_vectors(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
     # Tikhonov's inverse: what the array hardly sees gets no large emissions.
     damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)

@@ -18,10 +18,9 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
-from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
-from gsparc.models.reduced import Filled, MeanOnly
-from gsparc.models.target_rows import entry_variance, rows_of, to_real
+from gsparc.models.reduced import Interpolated, MeanOnly, Settings
+from gsparc.models.target_rows import entry_variance, power_rows, to_real
 from gsparc.processes.density import by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely_given_nearest
@@ -183,7 +182,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is None:
             return None
         result = copy.copy(self)
-        result.powers, _ = conditioned(rows_of(data, rows), self.powers.posterior.prior, 0)
+        result.powers, _ = conditioned(power_rows(data, rows), self.powers.posterior.prior, 0)
         return result
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
@@ -212,7 +211,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         """Targets (B, ...) of components (B, P)."""
         return self._decode(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
-    def knobs(self) -> tuple[str, ...]:
+    def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduced`."""
         if not isinstance(self.scores, Exact):
             return ("confidence",)
@@ -239,7 +238,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             lean.shape = tuple(-(-side // stride) for side in self.shape)
         lean.seen = len(lean.axes)
         means = MeanOnly(lean, lean.mean_at)
-        return Filled(means, grid, stride) if stride > 1 and grid is not None else means
+        return Interpolated(means, grid, stride) if stride > 1 and grid is not None else means
 
 
 def projected(

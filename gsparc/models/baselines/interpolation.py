@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import from_real, heard, left_out_note, rows_of, training_targets
+from gsparc.models.target_rows import from_real, heard_rows, power_rows, training_targets, unheard_note
 from gsparc.processes.powers import Rows
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
@@ -43,7 +43,7 @@ class Interpolator(Method):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
         known = np.concatenate([fold.train, fold.val])
-        rows = known if self.uses_censored else heard(data, known)
+        rows = known if self.uses_censored else heard_rows(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = TimeBudget()
@@ -52,10 +52,10 @@ class Interpolator(Method):
         # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
         before = set(vars(self))
         if self.uses_censored and data.site.kind == "rssi":
-            notes = self._learn_powers(rows_of(data, rows))
+            notes = self._learn_powers(power_rows(data, rows))
         else:
             own = self._learn(data.moving[rows], training_targets(data, rows))
-            notes = (*own, *left_out_note(data, known))
+            notes = (*own, *unheard_note(data, known))
         lost = sorted(set(vars(self)) - before - set(self.stored))
         if lost and type(self)._relearn is Interpolator._relearn:
             raise ValueError(

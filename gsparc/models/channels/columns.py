@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import LIGHT, Measurements, Site
-from gsparc.models.run_factors import aligning, run_quadratic
+from gsparc.models.run_factors import best_run_factors, run_quadratic
 from gsparc.ops import Pose
-from gsparc.ops.transforms import numbers
+from gsparc.ops.transforms import to_numpy
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 
@@ -132,7 +132,7 @@ class Group(At):
     @cached_property
     def displacements(self) -> bytes:
         """Equal for groups whose places differ by one displacement at most, to a micrometre."""
-        return numbers((self.places - self.places[0]).mul(1e6).round()).tobytes()
+        return to_numpy((self.places - self.places[0]).mul(1e6).round()).tobytes()
 
 
 def refuse(site: Site) -> None:
@@ -305,8 +305,8 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
-    # `aligning` tells what rows are to be multiplied by, the inverse of what they were.
-    estimates[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
+    # `best_run_factors` tells what rows are to be multiplied by, the inverse of what they were.
+    estimates[heard] = 1 / best_run_factors(quadratic[np.ix_(heard, heard)], size[heard])
     measured = torch.from_numpy(estimates)
     return measured / measured.abs() if ends_of(groups) > 1 else measured
 

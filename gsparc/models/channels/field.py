@@ -23,7 +23,7 @@ from gsparc.models.channels.terms import Direct, Images
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
-from gsparc.ops.transforms import numbers
+from gsparc.ops.transforms import to_numpy
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.factor import Factor
 from gsparc.processes.stored import restored, stored
@@ -233,7 +233,7 @@ class ChannelField(ClosedForm):
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
                 places = slot.places(moving[here], turned[here])
-                here_and_there = (numbers(one).tobytes() for one in (places, learned.places[:1]))
+                here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
                 key = slot.wavenumber, learned.displacements, *here_and_there
                 alike.setdefault(key, []).append((known, here, places))
         return list(alike.values())

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import needs_reference
 from gsparc.physics.waves import NEAR_M
 from gsparc.processes.kernel import IsotropicWaves, matern32_of_squares
 
@@ -39,7 +39,7 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
         along: (...) k d's component towards the direction.
         concentration: about it.
     """
-    if squared.requires_grad or along.requires_grad or beyond_kernels(squared, along):
+    if squared.requires_grad or along.requires_grad or needs_reference(squared, along):
         root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
         root = torch.where(root.abs() < 1e-9, root + 1e-9, root)
         return root.sinh() / root * (concentration / math.sinh(concentration))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
 from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
@@ -25,7 +25,6 @@ from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, en
 from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_phase_and_static_end
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.models.plain import made, plain
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -176,12 +175,12 @@ class DirectionalGP(SourcesInFrame):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"frame": self._fitted().state(), "posterior": plain(self.posterior)}
+        return {"frame": self._fitted().state(), "posterior": to_containers(self.posterior)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.frame = site, Frame(site, **state["frame"])
-        self.posterior = made(SightedSources, state["posterior"]).prepared()
+        self.posterior = from_containers(SightedSources, state["posterior"]).prepared()
 
     @property
     def terms(self) -> tuple[str, ...]:

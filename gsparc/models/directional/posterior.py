@@ -22,7 +22,7 @@ from gsparc.models.directional.visibility import VisibilityGP
 from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
-from gsparc.models.in_double import in_double
+from gsparc.models.method import to_double
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import apart, matern32_of_squares
@@ -136,7 +136,7 @@ class SightedSources:
     @cached_property
     def exact(self) -> SightedSources:
         """The same in float64, of what was computed in float32."""
-        return in_double(self.prepared())
+        return to_double(self.prepared())
 
     def prepared(self) -> SightedSources:
         """Return itself, with what all queries need; what the first makes might be for inference only."""

@@ -17,7 +17,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.field.initial import Snapshot
-from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
 from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path_scene, estimate_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
@@ -34,9 +34,7 @@ from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, r
 from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
-from gsparc.models.pareto import Settings
-from gsparc.models.plain import made, plain
-from gsparc.models.reduced import MeanOnly
+from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import image_rotations, normal_form
 from gsparc.physics.row_factors import Freedom, alignment_factors
 from gsparc.physics.waves import wave, wave_over_band
@@ -283,8 +281,8 @@ class ImageSourceGP(SourcesInFrame):
         predicted = (self.weights[:, None, None] * each).sum(0)
         return frame.left_out(self.members[0].rows, predicted)
 
-    def knobs(self) -> tuple[str, ...]:
-        """See `Method.knobs`."""
+    def reduction_settings(self) -> tuple[str, ...]:
+        """See `Method.reduction_settings`."""
         return ("searches", "confidence")
 
     @torch.no_grad()
@@ -305,15 +303,17 @@ class ImageSourceGP(SourcesInFrame):
             "frame": self._fitted().state(),
             "factors": self.factors,
             "weights": self.weights,
-            "rows": plain(self.members[0].rows),
-            "scenes": [plain(member.scene) for member in self.members],
+            "rows": to_containers(self.members[0].rows),
+            "scenes": [to_containers(member.scene) for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.frame = site, Frame(site, **state["frame"])
         self.factors, self.weights = state["factors"], state["weights"]
-        self._conditioned(made(Rows, state["rows"]), [made(Scene, scene) for scene in state["scenes"]])
+        self._conditioned(
+            from_containers(Rows, state["rows"]), [from_containers(Scene, scene) for scene in state["scenes"]]
+        )
 
     @property
     def terms(self) -> tuple[str, ...]:

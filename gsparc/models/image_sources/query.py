@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import Posterior, variance_along_and_across
 from gsparc.models.image_sources.rows import moving_end, ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
-from gsparc.models.in_double import in_double
+from gsparc.models.method import to_double
 from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import apart
@@ -94,7 +94,7 @@ class EnsembleMeans:
     @cached_property
     def exact(self) -> EnsembleMeans:
         """The same in float64."""
-        return in_double(self)
+        return to_double(self)
 
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,).

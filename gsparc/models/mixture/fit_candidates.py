@@ -18,15 +18,15 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
-from gsparc.models.left_out_images import LeftOut
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import Candidate
-from gsparc.models.mixture.weights import LEAST_HELD, Rows, comparable
+from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import late_when
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.race import Behind, Race, mean_square
+from gsparc.training.race import FellBehind, Race, mean_square
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ NEAR = 0.1  # share of the energy that another solution misses, below which few 
 BESIDE = 2  # searches then, of the usual effort
 
 
-def fit_all(
+def fit_candidates(
     parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
     fold: Fold, context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
 ) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
@@ -88,12 +88,12 @@ def fit_all(
             if name not in OPEN_ENDED:
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
-                target = comparable(data.batch(field.held.rows).target, data.site)
-                one = Race.of(field.held.rows, comparable(field.held.mean, data.site), target, note)
+                target = in_error_unit(data.batch(field.held.rows).target, data.site)
+                one = Race.of(field.held.rows, in_error_unit(field.held.mean, data.site), target, note)
                 note(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
-            if isinstance(error, Behind):  # a `ValueError`, too
+            if isinstance(error, FellBehind):  # a `ValueError`, too
                 reports[name] = FitReport(budget.counted.wall - began)
             elif len(parts) == 1 or name == init.name:
                 raise
@@ -139,22 +139,22 @@ def weigh_candidates(
             assert field.held is not None
             order = {row: place for place, row in enumerate(field.held.rows.tolist())}
             mean = torch.cat([field.held.mean[[order[row] for row in rows.tolist()]], mean])
-        predicted.append(comparable(mean, data.site))
+        predicted.append(in_error_unit(mean, data.site))
     rows = np.concatenate([rows, fold.val])
     if len(rows) < LEAST_HELD:
         log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
         return {first: (solutions[first], 1.0)}
-    target = comparable(data.batch(rows).target, data.site)
+    target = in_error_unit(data.batch(rows).target, data.site)
     assert cut is not None
     single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
     unit = np.where(cut.unit == NOT_TESTED, single, cut.unit)[rows]
     # A search that went on has errors of its own: here a mixture need not be surely better, too.
     sure = 0.0 if set(solutions).intersection(SEARCHES) else 1.0
-    weights = solution_weights.weights(predicted, target, unit, sure)
+    weights = solution_weights.stacking_weights(predicted, target, unit, sure)
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
             "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,
-            solution_weights.error(one, target), weight,
+            solution_weights.relative_error(one, target), weight,
         )  # fmt: skip
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 
@@ -214,17 +214,19 @@ def weigh_process(
     if len(val):
         batch = data.batch(val)
         means = (method.predict(batch).mean for method in (field, process))
-        own, plain, target = (comparable(values, data.site) for values in (*means, batch.target))
-        explained = solution_weights.explained(own, target, data.site.kind != "csi")
+        own, plain, target = (in_error_unit(values, data.site) for values in (*means, batch.target))
+        explained = solution_weights.explained_variance(own, target, data.site.kind != "csi")
         if spectra:
-            rows.append(Rows(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target))))
+            rows.append(
+                HeldOutPair(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target)))
+            )
         else:
-            weight = solution_weights.weights([own, plain], target, np.arange(len(val)))[1]
+            weight = solution_weights.stacking_weights([own, plain], target, np.arange(len(val)))[1]
     if left is not None:
         rows.append(_left_out(left, distance))
         if explained is None:
             own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
-            explained = solution_weights.explained(own, target, True)
+            explained = solution_weights.explained_variance(own, target, True)
     if spectra:
         weight = solution_weights.share_of_second(rows)
     log.info(
@@ -234,8 +236,8 @@ def weigh_process(
     return ((process, weight) if weight > 0 else None), explained
 
 
-def _left_out(left: LeftOut, distance: float | None) -> Rows:
+def _left_out(left: LeftOut, distance: float | None) -> HeldOutPair:
     """Training rows as far from what is left as held-out rows are, as field and process predict them."""
-    gap = left.as_far_as(distance)
+    gap = left.nearest_gap(distance)
     own, target = left.at(gap, left.predicted)
-    return Rows(own, left.at(gap, left.by_process())[0], target)
+    return HeldOutPair(own, left.at(gap, left.predict_by_process())[0], target)

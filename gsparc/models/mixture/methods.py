@@ -10,7 +10,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.terms import no_array, no_phase
+from gsparc.models.terms import array_obstacle, phase_obstacle
 from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext, FitReport
 
@@ -35,7 +35,7 @@ class ImageSources(Mixture):
 
     def obstacle(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        return no_phase(data)
+        return phase_obstacle(data)
 
 
 class Channels(Mixture):
@@ -101,4 +101,4 @@ class Bearings(Mixture):
 
     def obstacle(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        return no_array(data.site, "tx", "the receiver stands still")
+        return array_obstacle(data.site, "tx", "the receiver stands still")

@@ -24,14 +24,14 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import factors_of_runs
-from gsparc.models.closed_form import ClosedForm, LeftOutRows, restored, stored
-from gsparc.models.each_or_together import LearnsTogether
+from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
-from gsparc.models.mixture.weights import comparable, explained
-from gsparc.models.refined_places import displaced, errors_of, refined
+from gsparc.models.mixture.each_or_together import LearnsTogether
+from gsparc.models.mixture.weights import explained_variance, in_error_unit
+from gsparc.models.refined_places import errors_of, move_rows, refine_places
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
@@ -123,7 +123,7 @@ class Mixture(LearnsTogether, ClosedForm):
         # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refined(self, self.runs.aligned(data), std)
+        rows, by, note = refine_places(self, self.runs.aligned(data), std)
         if by.any() and budget.over():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -132,7 +132,7 @@ class Mixture(LearnsTogether, ClosedForm):
             return replace(report, notes=(note, *report.notes), limited_by=limited)
         limited, spent = report.limited_by, budget.counted.wall
         rest = replace(context, budget_s=budget.left_s)
-        report = self._solve(parts, init, displaced(data, rows, by), fold, rest)
+        report = self._solve(parts, init, move_rows(data, rows, by), fold, rest)
         limited = less_repeatable(limited, report.limited_by)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
         notes = (note, *report.notes)
@@ -142,22 +142,9 @@ class Mixture(LearnsTogether, ClosedForm):
         self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
         context: FitContext,
     ) -> FitReport:  # fmt: skip
-        """Fit and weigh candidates, of channels of several runs in the phase and level of one."""
-        budget, known = context.time_budget(), np.sort(np.concatenate([fold.train, fold.val]))
-        self.runs = _runs(data, known, context)
-        aligning = budget.counted.wall if len(self.runs) > 1 else 0.0
-        within = replace(context, budget_s=budget.left_s)
-        report = self._fit_members(parts, init, self.runs.aligned(data), fold, within)
-        if not aligning:
-            return report
-        cost = Cost({"factors of runs": aligning}) + report.cost
-        return replace(report, seconds=report.seconds + aligning, cost=cost)
-
-    def _fit_members(
-        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
-        context: FitContext,
-    ) -> FitReport:  # fmt: skip
         """Fit candidates, weigh several by rows held out, and condition them on all rows.
+
+        Channels of several runs are learned in the phase and level of one.
 
         Raises:
             ValueError: the only candidate, or the one asked for, cannot solve this.
@@ -166,12 +153,15 @@ class Mixture(LearnsTogether, ClosedForm):
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
+        self.runs = _runs(data, known, context)
+        data = self.runs.aligned(data)
+        stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
         cut = (
             cut_inner_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed)
             if several
             else None
         )
-        found, reports, read = fit_candidates.fit_all(
+        found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, budget, cut
         )
         chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
@@ -189,14 +179,14 @@ class Mixture(LearnsTogether, ClosedForm):
         seconds = budget.counted.wall
         if several:
             context.curve(seconds, "final")
-        stages = {name: report.seconds for name, report in reports.items()}
+        stages |= {name: report.seconds for name, report in reports.items()}
         # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages["final weights"] = seconds - self.init_s
         unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
         notes = [note for name in chosen for note in reports[name].notes]
         limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited).costing(Cost(stages, unused))
+        return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
 
     def _explained(self, data: Measurements, fold: Fold, apart: bool) -> float | None:
         """What Gaussians explain of validation rows; conditions on training rows, unless `apart` already."""
@@ -207,8 +197,8 @@ class Mixture(LearnsTogether, ClosedForm):
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
         assert result is not None
-        own, target = (comparable(one, data.site) for one in (result, batch.target))
-        return explained(own, target, data.site.kind != "csi")
+        own, target = (in_error_unit(one, data.site) for one in (result, batch.target))
+        return explained_variance(own, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Condition every member on the same rows."""
@@ -266,10 +256,9 @@ class Mixture(LearnsTogether, ClosedForm):
         made = [(weight, one) for weight, one in self.parts() if isinstance(one, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
-        result = [(weight, method.paths(query)) for weight, method in made]
-        gain = torch.cat([weight * one[0] for weight, one in result], dim=2)
-        delay = torch.cat([one[1] for _, one in result], dim=2)
-        unit, carrier = torch.cat([one[2] for _, one in result], dim=1), result[0][1][3]
+        gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
+        gain = torch.cat([weight * own for (weight, _), own in zip(made, gains, strict=True)], dim=2)
+        delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
         return *merge_equal_paths(gain, delay, unit, carrier), carrier
 
     # -- what it is made of --------------------------------------------------------------------------
@@ -331,14 +320,14 @@ class Mixture(LearnsTogether, ClosedForm):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "members": [stored(member) for member in self.members], "weights": list(self.weights),
+            "members": [method_state(member) for member in self.members], "weights": list(self.weights),
             "started": self.started, "explained": self.explained, "runs": self.runs.state(),
         }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.started, self.explained = site, str(state["started"]), state["explained"]
-        self.members = [restored(site, member) for member in state["members"]]
+        self.members = [method_from_state(site, member) for member in state["members"]]
         self.weights, self.runs = tuple(state["weights"]), RunFactors.read(state["runs"])
 
 

@@ -17,18 +17,18 @@ from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.schema import Site
+from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER, decibels
 
 LEAST_HELD = 4  # rows, for weights to mean anything
 LEAST_GAIN_DB = 0.2  # for which a query may take several times as long
 FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
-UNUSED = 0.05  # weight below which a predictor is left out
+UNUSED = 0.05  # weight below which a predictor is left out of a mixture
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
-LEAST_WEIGHT = 0.05  # of a prediction in a mixture, below which it is left out
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
-def weights(
+def stacking_weights(
     predicted: list[Tensor], target: Tensor, unit: np.ndarray, sure: float = 1.0
 ) -> tuple[float, ...]:
     """Return weights in [0, 1] of sum one: one alone, unless a mixture is surely better.
@@ -39,13 +39,13 @@ def weights(
         unit: (n,), rows of one unit are not independent.
         sure: see `choose_weights`.
     """
-    missed = torch.stack([real((one - target).detach()) for one in predicted], 1)  # (n, M, P)
+    missed = torch.stack([to_real_entries((one - target).detach()) for one in predicted], 1)  # (n, M, P)
     chosen = choose_weights((missed @ missed.mT).numpy(), unit, sure)
     return tuple(float(weight) for weight in chosen)
 
 
 @dataclass(frozen=True)
-class Rows:
+class HeldOutPair:
     """Rows that two predictors did not learn from.
 
     Attributes:
@@ -63,7 +63,7 @@ class Rows:
         return np.log(((mixed - self.target) ** 2).mean(1) + LEAST_ERROR)
 
 
-def share_of_second(parts: Sequence[Rows]) -> float:
+def share_of_second(parts: Sequence[HeldOutPair]) -> float:
     """Return the weight in [0, 1] of the second of two predictors that makes the mean PSNR of rows largest.
 
     0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
@@ -71,42 +71,42 @@ def share_of_second(parts: Sequence[Rows]) -> float:
     do not tell the two apart weigh them alike (J. M. Bates and C. W. J. Granger, 1969).
     """
     first, second = (np.concatenate([part.log_errors(share) for part in parts]) for share in (0.0, 1.0))
-    gain, unsure = paired(first - second, np.arange(len(first)))
+    gain, unsure = mean_and_error(first - second, np.arange(len(first)))
     if len(first) < FEW_ROWS and abs(gain) < 2 * unsure:
         return 0.5
     means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
-    if means[0] <= means[-1] and 10 / np.log(10) * (means[0] - min(means)) < LEAST_GAIN_DB:
+    if means[0] <= means[-1] and DECIBELS_PER_NAT * (means[0] - min(means)) < LEAST_GAIN_DB:
         return 0.0
     best = float(SHARES[int(np.argmin(means))])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
 
-def error(predicted: Tensor, target: Tensor) -> float:
+def relative_error(predicted: Tensor, target: Tensor) -> float:
     """Return the share of the target's energy that is missed."""
     missed = (predicted - target).abs().square().sum()
-    return float(missed / target.abs().square().sum().clamp_min(1e-30))
+    return float(missed / target.abs().square().sum().clamp_min(TINY_POWER))
 
 
-def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
+def explained_variance(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
     """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
     middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
-    whole = (target - middle).abs().square().sum().clamp_min(1e-30)
+    whole = (target - middle).abs().square().sum().clamp_min(TINY_POWER)
     return 1 - float((predicted - target).abs().square().sum() / whole)
 
 
-def comparable(values: Tensor, site: Site) -> Tensor:
+def in_error_unit(values: Tensor, site: Site) -> Tensor:
     """Return values in the unit that errors are counted in: powers in decibels."""
-    return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
+    return decibels(values) if site.kind == "rssi" else values
 
 
-def mixed(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
-    """Return the mean (n, ...) of two predictions in the unit of `comparable`, the other's of this weight."""
+def mix_means(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
+    """Return the mean (n, ...) of two predictions in the unit of errors, the other's of this weight."""
     if site.kind != "rssi":
         return own.lerp(other, weight)
-    return own.clamp_min(1e-30) ** (1 - weight) * other.clamp_min(1e-30) ** weight
+    return own.clamp_min(TINY_POWER) ** (1 - weight) * other.clamp_min(TINY_POWER) ** weight
 
 
-def real(values: Tensor) -> Tensor:
+def to_real_entries(values: Tensor) -> Tensor:
     """Return entries (n, P) float64 of values (n, ...), real and imaginary parts of complex ones."""
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
     return values.double().flatten(1)
@@ -124,7 +124,7 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
     return result / result.sum()
 
 
-def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
+def mean_and_error(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     """Mean of differences (n,) and its standard error, rows of one unit (n,) not being independent.
 
     Of few units it is larger, so that as many normal means lie within it (Student's t). It is infinite where
@@ -146,7 +146,7 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray, sure: float = 1.0) -> np.
 
     Args:
         gram: (n, K, K) products of the errors of n rows.
-        unit: (n,) of the rows, see `paired`.
+        unit: (n,) of the rows, see `mean_and_error`.
         sure: standard errors of the gain.
     """
     errors = np.einsum("nkk->nk", gram)
@@ -158,19 +158,19 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray, sure: float = 1.0) -> np.
     mixed = np.empty(len(gram))
     for number in range(int(part.max()) + 1):
         here = part == number
-        mixed[here] = squared(_pruned(gram[~here].mean(0)), gram[here])
-    gain, error = paired(errors[:, winner] - mixed, unit)
+        mixed[here] = mixture_errors(_pruned(gram[~here].mean(0)), gram[here])
+    gain, error = mean_and_error(errors[:, winner] - mixed, unit)
     return _pruned(gram.mean(0)) if gain > sure * error else single
 
 
-def squared(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
+def mixture_errors(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
     """Return the squared errors (n,) of a mixture (K,) from products (n, K, K)."""
     return np.einsum("k,nkl,l->n", weights, gram, weights)
 
 
 def _pruned(gram: np.ndarray) -> np.ndarray:
     """The best weights (K,) without those that matter little."""
-    large = best_weights(gram) >= LEAST_WEIGHT
+    large = best_weights(gram) >= UNUSED
     result = np.zeros(len(gram))
     result[large] = best_weights(gram[np.ix_(large, large)])
     return result

@@ -18,8 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.in_double import in_double
-from gsparc.models.method import Prediction
+from gsparc.models.method import Prediction, to_double
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduced
@@ -32,9 +31,9 @@ from gsparc.models.moving_array.triangulate import (
     pixel_exponent,
     site_problem,
 )
-from gsparc.models.target_rows import heard, to_real, training_targets
+from gsparc.models.target_rows import heard_rows, to_real, training_targets
+from gsparc.physics.fit_separable import Separable, fit_separable
 from gsparc.physics.lags import BLOCK, SpectrumLags
-from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -108,7 +107,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         self._budget, self._lags = context.time_budget(), None
         report = super().fit(data, fold, context)
         # The rows of `super().fit` in its order: `left_out` names its images by them.
-        self.rows = heard(data, np.concatenate([fold.train, fold.val]))
+        self.rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
         return replace(report, limited_by=self._budget.limited_by)
 
     @property
@@ -116,7 +115,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Name sources seen through the array, and a residual where one is fitted."""
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
-    def knobs(self) -> tuple[str, ...]:
+    def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduced`."""
         return ("keep", "stride", "confidence")
 
@@ -142,7 +141,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Solve powers, trends, residual and errors anew, with the sources and kernels of the fit."""
-        self.rows = rows = heard(data, rows)
+        self.rows = rows = heard_rows(data, rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
@@ -249,7 +248,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         """See `Differentiable`; `explained` are the sources' images alone."""
         query, errors = self.query(), self.errors
         if dtype == torch.float64:
-            query, errors = query.exact, in_double(errors)
+            query, errors = query.exact, to_double(errors)
         answer = query(queries)
         # Stored pixels lie in [0, 1]; sources and residual need not add up to such.
         mean = answer.image.clamp_(0, 1)

@@ -14,14 +14,12 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.models.in_double import in_double
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, mix_lags
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Filled, View
-from gsparc.ops.transforms import followed
+from gsparc.models.reduced import Interpolated, Settings, View
+from gsparc.ops.transforms import is_differentiated
 from gsparc.physics.lags import SpectrumLags
 from gsparc.physics.separable import Separable
 from gsparc.processes.kernel import apart
@@ -51,7 +49,7 @@ class ReceivingArray:
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
         """Return images (n, H, W) of sources of powers (n, K)."""
         images = self.space.spectrum(mix_lags(power, self.atoms(sources, receivers)), self._pixels)
-        if self.exponent == 1 or not followed(images):
+        if self.exponent == 1 or not is_differentiated(images):
             return images if self.exponent == 1 else images.sqrt()
         bright = images > 0  # at 0 a root has no slope
         return torch.where(bright, torch.where(bright, images, 1.0).sqrt(), 0.0)
@@ -105,7 +103,7 @@ class ImageRenderer:
     @cached_property
     def exact(self) -> ImageRenderer:
         """The same in float64."""
-        return in_double(self)
+        return to_double(self)
 
 
 def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
@@ -124,7 +122,7 @@ def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Te
         raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
     count = math.ceil(float(settings.get("keep", 1.0)) * len(method.residual.axes))
     lean = ReducedMean(method, count, stride)
-    return Filled(lean, grid, stride) if stride > 1 else lean
+    return Interpolated(lean, grid, stride) if stride > 1 else lean
 
 
 class ReducedMean(View):

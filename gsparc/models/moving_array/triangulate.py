@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
-from gsparc.models.terms import no_array
+from gsparc.models.terms import array_obstacle
 from gsparc.ops import SphereGrid
 from gsparc.physics.draws import draw_in_box
 from gsparc.physics.lags import SpectrumLags
@@ -200,7 +200,7 @@ def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
 def site_problem(data: Measurements) -> str | None:
     """Return why sources cannot be triangulated from these measurements; None when they can."""
     otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
-    problem = no_array(data.site, "tx", otherwise)
+    problem = array_obstacle(data.site, "tx", otherwise)
     if problem is not None:
         return problem
     if not np.allclose(data.rx_rotation, data.rx_rotation[0], atol=1e-6):

@@ -18,7 +18,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import heard, to_real
+from gsparc.models.target_rows import heard_rows, to_real
 from gsparc.simulate.calibration import (
     GENERIC,
     Calibration,
@@ -102,7 +102,7 @@ class CalibratedRayTracer(Method):
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
         self._scene_json, self._tracer = json.dumps(asdict(scene)), None
-        rows = heard(data, np.concatenate([fold.train, fold.val]))
+        rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
         # Measurements are local, the tracer's scene is in world coordinates.
         places, measured = data.moving[rows] + data.site.origin, _levels(data, rows)
         tracer = self._ready()

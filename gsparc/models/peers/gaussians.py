@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from gsparc.data.query import Query
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
-from gsparc.field.model import FULL_SPHERE_ROWS
+from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
+from gsparc.field.model import FULL_SPHERE_ROWS, RasterSettings
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 
-MARGIN = 2.0  # [m] around the moving end's box
-OPACITY = 0.3
+SHIFT = 0.1  # [m], of directions [rad], that a place moves by per unit of the network's output
+MOST_STRETCH = 3.0  # of a log scale, a factor of 20 either way: exp of what a network says has no bound
 GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
     "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
 }  # fmt: skip
@@ -47,7 +47,7 @@ class DeformedPeer(GaussianPeer):
         others: see `TrainedPeer`.
     """
 
-    count: int = 500
+    count: int = FieldSettings().count
     width: int = 64
     depth: int = 3
     octaves: int = 5
@@ -67,19 +67,19 @@ class GaussianNetwork(Network):
         return self.field.cloud(strengths, "emission of a Gaussian")
 
 
-def gaussians_of(scene: Scene, count: int) -> GaussianField:
-    """Draw all around a static receiver between 1 and 6 m; of a moving one in its box and 2 m around."""
+def initial_gaussians(scene: Scene, count: int) -> GaussianField:
+    """Draw them where `FieldSettings` says: around a static receiver, else in and about the box."""
     static = scene.receiver
     place, turn = (None, None) if static is None else (static.position, static.rotation)
     init: Literal["uniform", "sphere"] = "uniform" if static is None else "sphere"
-    settings = FieldSettings(count, init, margin=MARGIN, opacity=OPACITY)
-    return initial_field(settings, scene.box, place, turn)
+    return create_field(FieldSettings(count, init), scene.box, place, turn)
 
 
-def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
+def rendering_options(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
     """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
-    return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(1e-3, relative=True)}
+    least = RasterSettings().relative_cutoff
+    return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(least, relative=True)}
 
 
 def render_each(

@@ -24,18 +24,17 @@ from torch import Tensor, nn
 
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
+from gsparc.field.gaussians import FieldSettings
 from gsparc.field.losses import task_loss
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
     GaussianPeer,
-    gaussians_of,
-    rendering_of,
+    initial_gaussians,
+    rendering_options,
 )
-from gsparc.models.peers.trained import Scene
+from gsparc.models.peers.trained import Scene, magnitude
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
-
-TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
 
 class ComplexGaussians(GaussianNetwork):
@@ -46,9 +45,9 @@ class ComplexGaussians(GaussianNetwork):
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight
         self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
-        self.field = gaussians_of(scene, count)
-        self.grid, self.options = rendering_of(scene)
-        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(self.degree, self.order), 2))
+        self.field = initial_gaussians(scene, count)
+        self.grid, self.options = rendering_options(scene)
+        self.coefficients = nn.Parameter(0.02 * torch.randn(count, count_terms(self.degree, self.order), 2))
         with torch.no_grad():
             # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
@@ -80,7 +79,7 @@ class ComplexGaussians(GaussianNetwork):
             seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
-        return _magnitude(rasterize(*geometry, sent, rx, self.grid, **self.options).image)
+        return magnitude(rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1))
 
     def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
@@ -112,7 +111,7 @@ class ComplexGaussians(GaussianNetwork):
             geometry = self.field.geometry()
             plan = make_plan(*geometry, rx, self.grid, **self.options)
             self._frozen = freeze(plan, *geometry, version=0)
-        return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
+        return magnitude(self._frozen.render(self.radiance(tx, rx), 0).square().sum(1))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -130,7 +129,7 @@ class GSRF(GaussianPeer):
     rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
     makes = ComplexGaussians
     name: str = "gsrf"
-    count: int = 500
+    count: int = FieldSettings().count
     degree: int = 5
     order: int = 5
     ssim_weight: float = 0.19
@@ -138,12 +137,7 @@ class GSRF(GaussianPeer):
     rate: float = 8e-3
 
 
-def _magnitude(image: Tensor) -> Tensor:
-    """(B, 2, H, W) -> (B, H, W)."""
-    return (image.square().sum(1) + TINY).sqrt()
-
-
-def terms(degree: int, order: int) -> int:
+def count_terms(degree: int, order: int) -> int:
     """Return the number of terms of `fourier_legendre`."""
     return (degree + 1) * (2 * order + 1)
 

@@ -24,12 +24,11 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, magnitude, perceptron
 from gsparc.ops import Pose
 
 REFERENCE = 0.025  # [m] at which a signal has unit gain: 1/d without its constant
 POINTS = 2**16  # evaluated at a time at inference
-TINY = 1e-8  # under the root of a magnitude
 
 
 class MarchedField(Network):
@@ -44,26 +43,25 @@ class MarchedField(Network):
         self.far = 1.5 * scene.reach if settings.far_m is None else settings.far_m
         centre = scene.box.mean(0) if scene.receiver is None else scene.receiver.position
         around = torch.stack([centre - self.far, centre + self.far])
-        sphere = torch.tensor([[-1.0] * 3, [1.0] * 3])
         octaves, width, half = settings.octaves, settings.width, settings.depth // 2
         self.place = PositionEncoding(EncodingSettings("fourier", octaves), around)
         self.query = PositionEncoding(EncodingSettings("fourier", octaves), scene.box)
-        self.heading = PositionEncoding(EncodingSettings("fourier", settings.view_octaves), sphere)
+        self.heading = PositionEncoding(EncodingSettings("fourier", settings.view_octaves), DIRECTIONS)
         self.early = perceptron(self.place.width, width, width, half)
         self.late = perceptron(self.place.width + width, 2 + width, width, settings.depth - half - 1)
         # The first layer is linear: what all samples of a ray share is added, not repeated.
         self.by_feature = nn.Linear(width, width)
         self.by_ray = nn.Linear(self.heading.width + self.query.width, width)
         self.signal = perceptron(width, 2, width // 2, 1)
-        self.register_buffer("directions", scene.site.grid.directions(torch.float32).reshape(-1, 3))
+        self.register_buffer("directions", scene.site.grid.directions(torch.float32).flatten(0, -2))
 
     def march(self, origin: Tensor, heading: Tensor, query: Tensor) -> Tensor:
         """Return magnitudes (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
         step = self.far / self.samples
         depth = step * torch.arange(self.samples)
         places = origin[:, None] + depth[:, None] * heading[:, None]
-        place = self.place(places.reshape(-1, 3))
-        out = self.late(torch.cat([place, self.early(place).relu()], -1)).view(*places.shape[:2], -1)
+        place = self.place(places)
+        out = self.late(torch.cat([place, self.early(place).relu()], -1))
         shared = self.by_ray(torch.cat([self.heading(heading), self.query(query)], -1))
         signal = self.signal((self.by_feature(out[..., 2:]) + shared[:, None]).relu())
         raw = torch.stack([out[..., :2], signal])  # of attenuation and signal: size and phase
@@ -71,7 +69,7 @@ class MarchedField(Network):
         thick, turn = step * size[0], step * phase[0]
         gain = (thick - thick.cumsum(1)).exp() * size[1] * REFERENCE / (depth + step)
         wave = torch.polar(gain, turn.cumsum(1) - turn + phase[1])
-        return (wave.sum(1).abs().square() + TINY).sqrt()
+        return magnitude(wave.sum(1).abs().square())
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Mean squared error () of rays drawn at random."""
@@ -97,7 +95,7 @@ class MarchedField(Network):
         """Origins and world directions (R, 3) of the pixels of samples."""
         local = self.directions[pixel]
         if not rx.batched:
-            return rx.position.expand(len(pixel), 3), local @ rx.rotation.T
+            return rx.position.expand_as(local), local @ rx.rotation.T
         return rx.position[sample], (rx.rotation[sample] @ local.unsqueeze(-1)).squeeze(-1)
 
 

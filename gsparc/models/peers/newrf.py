@@ -27,7 +27,7 @@ from torch import Tensor
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind, Measurements
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose
 from gsparc.physics.rays import closest_approach
 
@@ -39,54 +39,11 @@ LEAST = 5  # meeting points of a virtual transmitter: fewer meet by chance
 NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
 
 
-@dataclass(eq=False, kw_only=True)
-class NeWRF(TrainedPeer):
-    """Channels of one antenna and one tone, with directions of arrival.
-
-    Args:
-        width, depth, octaves: of the network.
-        samples: points per ray, half of them fine.
-        neighbours: training receivers that vote at a query.
-        others: see `TrainedPeer`.
-    """
-
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
-    name: str = "newrf"
-    width: int = 128
-    depth: int = 4
-    octaves: int = 8
-    samples: int = 64
-    neighbours: int = 6
-
-    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return virtual transmitters, and which of them every training receiver sees.
-
-        Raises:
-            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
-        """
-        if data.directions is None:
-            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
-        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
-            raise ValueError(
-                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
-            )
-        places = data.rx_position[rows]
-        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
-        centres, seen = virtual_transmitters(places, rays)
-        if not len(centres):
-            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
-        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
-        return {**found, "votes": votes(seen, len(centres))}
-
-    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`."""
-        return DirectedRays(scene, precomputed, self)
-
-
 class DirectedRays(Network):
     """The network and the march."""
 
-    def __init__(self, scene: Scene, precomputed: dict[str, Tensor], settings: NeWRF) -> None:
+    def __init__(self, scene: Scene, settings: NeWRF) -> None:
+        precomputed = settings.precomputed
         super().__init__(scene, len(precomputed["virtual"]))
         assert scene.site.wavelength is not None
         self.precomputed = precomputed
@@ -96,7 +53,7 @@ class DirectedRays(Network):
         self.far = float(torch.quantile(reach[precomputed["votes"].T > 0], 0.99)) + AROUND
         around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
         self.place = PositionEncoding(EncodingSettings("fourier", settings.octaves), around)
-        self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.heading = PositionEncoding(EncodingSettings("fourier", 2), DIRECTIONS)
         inputs = self.place.width + self.heading.width
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
@@ -125,9 +82,8 @@ class DirectedRays(Network):
         fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
         depth = torch.cat([coarse, fine], -1).sort(-1).values
         points = places[:, None, None] + depth[..., None] * heading[:, :, None]
-        place = self.place(points.reshape(-1, 3)).view(*depth.shape, -1)
-        turn = self.heading(heading.reshape(-1, 3)).view(*heading.shape[:2], 1, -1)
-        out = self.network(torch.cat([place, turn.expand(-1, -1, self.samples, -1)], -1))
+        turn = self.heading(heading)[:, :, None].expand(-1, -1, self.samples, -1)
+        out = self.network(torch.cat([self.place(points), turn], -1))
         # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
         opacity = out[..., 2] - math.log(self.samples)
         clear = F.logsigmoid(-opacity)  # finite also where the sigmoid rounds to 1
@@ -138,17 +94,58 @@ class DirectedRays(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return channels (B, 1, 1) at searched directions."""
-        places = rx.position.reshape(-1, 3)
+        places = torch.atleast_2d(rx.position)
         return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Mean squared error along measured directions."""
-        places = batch.rx.position.reshape(-1, 3)
+        places = torch.atleast_2d(batch.rx.position)
         seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()
 
 
-def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+@dataclass(eq=False, kw_only=True)
+class NeWRF(TrainedPeer):
+    """Channels of one antenna and one tone, with directions of arrival.
+
+    Args:
+        width, depth, octaves: of the network.
+        samples: points per ray, half of them fine.
+        neighbours: training receivers that vote at a query.
+        others: see `TrainedPeer`.
+    """
+
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
+    makes = DirectedRays
+    name: str = "newrf"
+    width: int = 128
+    depth: int = 4
+    octaves: int = 8
+    samples: int = 64
+    neighbours: int = 6
+
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Return virtual transmitters, and which of them every training receiver sees.
+
+        Raises:
+            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
+        """
+        if data.directions is None:
+            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
+        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
+            raise ValueError(
+                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
+            )
+        places = data.rx_position[rows]
+        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
+        centres, seen = locate_transmitters(places, rays)
+        if not len(centres):
+            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
+        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
+        return {**found, "votes": count_votes(seen, len(centres))}
+
+
+def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return points where rays of several receivers meet, and which of them every receiver sees.
 
     Args:
@@ -168,7 +165,7 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         known = np.ma.masked_invalid(np.concatenate(meetings, 1))
         distance = np.ma.median(known, axis=1).filled(np.nan)
         points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
-    flat = np.concatenate(points) if points else np.zeros((0, 3))
+    flat = np.concatenate([places[:0], *points])
     centres = _merged(flat[np.isfinite(flat[:, 0])])
     return centres, [_passed(place, own, centres) for place, own in zip(places, rays, strict=True)]
 
@@ -189,7 +186,7 @@ def _merged(points: np.ndarray) -> np.ndarray:
     Where none has as many, of the largest.
     """
     if not len(points):
-        return np.zeros((0, 3))
+        return points
     free = np.full(len(points), True)
     around = cKDTree(points).query_ball_point(points, MERGE)
     clusters = []
@@ -201,7 +198,7 @@ def _merged(points: np.ndarray) -> np.ndarray:
     return np.stack([np.median(points[rows], axis=0) for rows in clusters if len(rows) >= least])
 
 
-def votes(seen: list[np.ndarray], count: int) -> Tensor:
+def count_votes(seen: list[np.ndarray], count: int) -> Tensor:
     """Return how many rays of each receiver point at each virtual transmitter: (n, V) float32."""
     table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
     return torch.from_numpy(table.astype(np.float32))

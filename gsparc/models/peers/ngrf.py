@@ -29,47 +29,24 @@ MARGIN = 3.0  # [m] around the moving end's box, where radiators start
 TRANSMITTER_SPREAD = 0.05  # [m] of the one that starts at a known transmitter
 
 
-@dataclass(eq=False, kw_only=True)
-class NGRF(TrainedPeer):
-    """Channels, and spectra of a static array.
-
-    Args:
-        count: Gaussians.
-        others: see `TrainedPeer`.
-    """
-
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0038, "spectrum": 0.020}
-    rates: ClassVar[dict[str, float]] = {
-        "means": 3e-3, "log_extents": 5e-3, "gains": 1e-2, "antennas": 5e-3,
-    }  # fmt: skip
-    name: str = "ngrf"
-    count: int = 30
-    rate: float = 5e-3
-
-    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""
-        site = scene.site
-        if site.subcarriers_hz is None and site.carrier_hz is None:
-            raise ValueError(f"{self.name}: the dataset declares no frequency, waves have no phase without")
-        if site.kind == "spectrum" and (site.array is None or scene.receiver is None):
-            raise ValueError(f"{self.name}: spectra need a static receiver with a declared array")
-        return Radiators(scene, self.count)
-
-
 class Radiators(Network):
-    """N radiators."""
+    """N radiators; `ValueError` without a frequency, or for spectra without an array."""
 
     wavenumbers: Tensor
     steering: Tensor | None
 
-    def __init__(self, scene: Scene, count: int) -> None:
-        super().__init__(scene, count)
-        spectrum = scene.site.kind == "spectrum"
-        antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
+    def __init__(self, scene: Scene, settings: NGRF) -> None:
+        super().__init__(scene, settings.count)
+        site, count, name, spectrum = scene.site, self.count, settings.name, scene.site.kind == "spectrum"
+        if site.subcarriers_hz is None and site.carrier_hz is None:
+            raise ValueError(f"{name}: the dataset declares no frequency, waves have no phase without")
+        if spectrum and (site.array is None or scene.receiver is None):
+            raise ValueError(f"{name}: spectra need a static receiver with a declared array")
+        antennas, tones = (len(site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN
-        means = low + (high - low) * torch.rand(count, 3)
-        if scene.site.static_end == "tx" and scene.site.static_position is not None:
-            means[0] = torch.from_numpy(scene.site.static_position) + TRANSMITTER_SPREAD * torch.randn(3)
+        means = low + (high - low) * torch.rand(count, len(low))
+        if site.static_end == "tx" and site.static_position is not None:
+            means[0] = torch.from_numpy(site.static_position) + TRANSMITTER_SPREAD * torch.randn_like(low)
         self.means = nn.Parameter(means)
         self.log_extents = nn.Parameter(torch.full((count,), math.log(0.05)))
         self.gains = nn.Parameter(torch.randn(count, 2) * scene.reach / math.sqrt(2 * count))
@@ -77,7 +54,7 @@ class Radiators(Network):
         response[..., 0] = 1
         matrix = None
         if spectrum:  # a Gaussian starts as a plane wave from where it stands
-            site, receiver = scene.site, scene.receiver
+            receiver = scene.receiver
             assert receiver is not None and site.grid is not None and site.array is not None
             assert site.wavelength is not None
             matrix = steering(site.array, site.grid, site.wavelength).to(torch.complex64)
@@ -86,8 +63,8 @@ class Radiators(Network):
             response = torch.view_as_real(torch.polar(torch.ones(()), 2 * math.pi * turns))
         self.register_buffer("steering", matrix, persistent=False)
         self.antennas = nn.Parameter(response)
-        hertz = scene.site.subcarriers_hz
-        hertz = torch.as_tensor([scene.site.carrier_hz] * tones if hertz is None else hertz)  # type: ignore
+        hertz = site.subcarriers_hz
+        hertz = torch.as_tensor([site.carrier_hz] * tones if hertz is None else hertz)  # type: ignore
         self.register_buffer("wavenumbers", (2 * math.pi / LIGHT * hertz).float())  # type: ignore
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
@@ -102,3 +79,20 @@ class Radiators(Network):
             return arriving
         image = bartlett(arriving[..., 0], self.steering)
         return normalise_spectrum(image, self.scene.site.normalisation).view(-1, *self.scene.shape)
+
+
+@dataclass(eq=False, kw_only=True)
+class NGRF(TrainedPeer):
+    """Channels, and spectra of a static array.
+
+    Args:
+        count: Gaussians.
+        others: see `TrainedPeer`.
+    """
+
+    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0038, "spectrum": 0.020}
+    rates: ClassVar[dict[str, float]] = {"means": 3e-3, "gains": 1e-2}
+    makes = Radiators
+    name: str = "ngrf"
+    count: int = 30
+    rate: float = 5e-3

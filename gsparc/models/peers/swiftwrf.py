@@ -23,15 +23,21 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
-from gsparc.models.peers.gaussians import Deformation, DeformedPeer, GaussianNetwork, render_each
-from gsparc.models.peers.trained import Scene
+from gsparc.models.peers.gaussians import (
+    MOST_STRETCH,
+    SHIFT,
+    Deformation,
+    DeformedPeer,
+    GaussianNetwork,
+    render_each,
+)
+from gsparc.models.peers.trained import DIRECTIONS, Scene
 from gsparc.ops import Cutoff, Pose, SphereGrid
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
 THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other lose a twentieth on average
 CUTOFF = Cutoff(3e-3, relative=True)
 FLAT = 1e-4  # [m] of the third axis, at a metre
-SHIFT = 0.1  # [rad] per unit of the network's output
 
 
 class PlanarGaussians(GaussianNetwork):
@@ -45,7 +51,7 @@ class PlanarGaussians(GaussianNetwork):
         super().__init__(scene, settings.count)
         assert scene.site.grid is not None
         self.grid, count = scene.site.grid, settings.count
-        base, axes = lattice(self.grid, count)
+        base, axes = sphere_lattice(self.grid, count)
         self.register_buffer("base", base)
         self.register_buffer("axes", axes)
         self.register_buffer("frames", frame_quaternions(axes, base))
@@ -54,8 +60,7 @@ class PlanarGaussians(GaussianNetwork):
         self.log_widths = nn.Parameter(torch.full((count, 2), math.log(spacing / 2)))
         self.angles = nn.Parameter(torch.zeros(count))
         self.strengths = nn.Parameter(torch.full((count,), 0.2))
-        sphere = torch.tensor([[-1.0] * 3, [1.0] * 3])
-        self.deformation = Deformation(sphere, scene.box, sum(CHANGES), settings)
+        self.deformation = Deformation(DIRECTIONS, scene.box, sum(CHANGES), settings)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return spectra (B, H, W)."""
@@ -63,18 +68,19 @@ class PlanarGaussians(GaussianNetwork):
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
-        # A factor of 20 either way: exp of what a network says has no bound.
-        widths = (self.log_widths + stretch.clamp(-3, 3)).exp()
+        widths = (self.log_widths + stretch.clamp(-MOST_STRETCH, MOST_STRETCH)).exp()
         flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
         batch = len(moved)
-        quats = turned_about_normal(self.frames, angle)
+        quats = turn_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
         # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
-        here = Pose(torch.zeros(3), torch.eye(3))
-        image = render_each(geometry, strength, here, self.grid, cutoff=CUTOFF, compensate=False)
+        here = torch.zeros_like(self.base[0])
+        image = render_each(
+            geometry, strength, Pose.identity(here), self.grid, cutoff=CUTOFF, compensate=False
+        )
         return image.squeeze(1)
 
     def _changes(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
@@ -95,7 +101,7 @@ class PlanarGaussians(GaussianNetwork):
             raise ValueError("Gaussians of directions around a receiver that moves lie nowhere")
         towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
         means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
-        turned = turned_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
+        turned = turn_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
         own = Rotation.from_matrix(receiver.rotation.numpy())
         quats = own * Rotation.from_quat(turned, scalar_first=True)
         widths = self.log_widths.exp().double().numpy()
@@ -111,16 +117,14 @@ class SwiftWRF(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
     step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.031}
-    rates: ClassVar[dict[str, float]] = {
-        "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
-    }  # fmt: skip
+    rates: ClassVar[dict[str, float]] = {"centres": 2e-3, "strengths": 1e-2}
     makes = PlanarGaussians
     name: str = "swiftwrf"
     count: int = 300
     rate: float = 5e-3
 
 
-def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
+def sphere_lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
     """Return `count` even directions (N, 3) over the grid's part of a sphere, and tangents (N, 2, 3)."""
     low = grid.first_elevation - grid.elevation_step / 2
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
@@ -143,7 +147,7 @@ def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
 
 
-def turned_about_normal(frame: Tensor, half: Tensor) -> Tensor:
+def turn_about_normal(frame: Tensor, half: Tensor) -> Tensor:
     """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.gradient_stage import run_stage, steps_asked_for
+from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import task_loss
-from gsparc.field.module import NetworkModule
+from gsparc.field.module import LossSettings, NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget, less_repeatable
@@ -32,6 +32,8 @@ FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
 SLACK = 3.0  # times the seconds that are wanted, after which a schedule of a table's steps is cut
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
+DIRECTIONS = torch.tensor([[-1.0], [1.0]]).repeat(1, 3)  # box (2, 3) of unit vectors
+LEAST_POWER = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,8 @@ class Scene:
     @property
     def receiver(self) -> Pose | None:
         """Pose of the static receiver; None when it moves."""
-        if self.site.static_end == "tx" or self.site.static_position is None:
-            return None
-        turn = np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
-        return Pose(*(torch.from_numpy(one).float() for one in (self.site.static_position, turn)))
+        moves = self.site.static_end == "tx" or self.site.static_position is None
+        return None if moves else Query.at(self.site, self.box).rx
 
     @property
     def reach(self) -> float:
@@ -72,7 +72,7 @@ class Network(nn.Module):
         count: Gaussians, or virtual transmitters.
     """
 
-    ssim_weight = 0.2  # share of the loss of spectra
+    ssim_weight = LossSettings().ssim_weight
     snapshot: Snapshot = "none"
 
     def __init__(self, scene: Scene, count: int = 0) -> None:
@@ -96,6 +96,11 @@ def perceptron(
     sizes = [inner, *[width] * depth]
     layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), activation())]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
+
+
+def magnitude(power: Tensor) -> Tensor:
+    """Return roots, with a slope that is finite at zero."""
+    return (power + LEAST_POWER).sqrt()
 
 
 @dataclass(eq=False, kw_only=True)
@@ -135,11 +140,6 @@ class TrainedPeer(Method):
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
 
-    def build(self, scene: Scene, precomputed: dict[str, Tensor]) -> Network:
-        """Return the untrained network of a scene; `precomputed` is what was computed before training."""
-        network: Network = self.makes(scene, self)
-        return network
-
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return tensors computed from the training rows (n,) before training; stored with the weights."""
         return {}
@@ -160,21 +160,25 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: the training set is empty")
         origin = Origin.of(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
-        asked = steps_asked_for(context, len(rows), self.max_steps)
+        asked = requested_steps(context, len(rows), self.max_steps)
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
-        self.network = self.build(_scene(data, rows), self.precomputed)
+        self.network = self.makes(_scene(data, rows), self)
         if context.resume is not None:
-            origin.refuse_other(interrupted(context.resume))
+            origin.require_same(read_interrupted(context.resume))
         own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
         module = self.module(max(round(own), 1) if asked is None else asked, context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
-        ran = run_stage(module, data, Fold(rows, rows[:0], fold.test), context, files, budget)
-        self.steps = ran.taken
+        all_rows = Fold(rows, rows[:0], fold.test)
+        trainer, batches = make_trainer(module, data, all_rows, context, files, budget)
+        with interruptible(trainer, batches):
+            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
+        result = read_trainer_result(trainer, budget)
+        self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        limited_by = less_repeatable(budget.limited_by, "wall" if ran.timed_out else None)
+        limited_by = less_repeatable(budget.limited_by, "wall" if result.timed_out else None)
         return FitReport(budget.counted.wall, (note,), limited_by)
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
@@ -218,7 +222,7 @@ class TrainedPeer(Method):
         """See `Method.restore`."""
         self.site, scene = site, Scene(site, tuple(state["shape"]), state["box"])
         self.precomputed, self.steps = dict(state["found"]), int(state["steps"])
-        self.network = self.build(scene, self.precomputed)
+        self.network = self.makes(scene, self)
         self.network.load_state_dict(state["network"])
         self.network.eval()
 

@@ -19,18 +19,19 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
+    MOST_STRETCH,
+    SHIFT,
     Deformation,
     DeformedPeer,
     GaussianNetwork,
-    gaussians_of,
+    initial_gaussians,
     render_each,
-    rendering_of,
+    rendering_options,
 )
 from gsparc.models.peers.trained import Scene
 from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
-SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
 
 
 class DeformedGaussians(GaussianNetwork):
@@ -38,8 +39,8 @@ class DeformedGaussians(GaussianNetwork):
 
     def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
         super().__init__(scene, settings.count)
-        self.grid, self.options = rendering_of(scene)
-        self.field = gaussians_of(scene, self.count)
+        self.grid, self.options = rendering_options(scene)
+        self.field = initial_gaussians(scene, self.count)
         self.signals = nn.Parameter(torch.zeros(self.count))
         places = torch.stack(self.field.means.detach().aminmax(dim=0))
         self.deformation = Deformation(places, scene.box, sum(CHANGES), settings)
@@ -48,8 +49,9 @@ class DeformedGaussians(GaussianNetwork):
         """Return spectra (B, H, W)."""
         field = self.field
         place, turn, stretch, fade, light = self._changes(tx, rx)
+        stretch = stretch.clamp(-MOST_STRETCH, MOST_STRETCH)
         geometry = (
-            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch.clamp(-3, 3)).exp(),
+            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch).exp(),
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
         )  # fmt: skip
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)

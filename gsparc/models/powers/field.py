@@ -27,7 +27,7 @@ from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.models.powers.own_terms import InWorld, learned
 from gsparc.models.powers.settings import LAW_NEEDS, candidates, chosen_among, mixture
-from gsparc.models.target_rows import entry_variance, from_real, rows_of
+from gsparc.models.target_rows import entry_variance, from_real, power_rows
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximated
@@ -94,7 +94,7 @@ class PowerField(ClosedForm):
 
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
-        seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
+        seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
         more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
         for one in more:  # once: a query has no time for it, nor has `torch.func`
             one.check(torch.from_numpy(seen.places))
@@ -157,7 +157,7 @@ class PowerField(ClosedForm):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
-        seen = rows_of(data, rows)
+        seen = power_rows(data, rows)
         own, *others = ((share, conditioned(seen, prior, self.seed)[0]) for share, prior in self.priors)
         self.powers = replace(own[1], others=tuple(others))
         # The tree is of the rows before.

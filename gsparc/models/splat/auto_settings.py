@@ -36,7 +36,7 @@ class Choices:
         return self.init in ("images", "vectors")
 
 
-def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
+def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
     """Return choices for a site, and lines on those left `auto`: "init=auto -> uniform: the receiver moves".
 
     A closed-form start needs spectra, a static receiver, a linear read-out and kernel features. Hidden units
@@ -88,7 +88,7 @@ def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choice
     return Choices(start, encoding, activation, float(bias)), tuple(notes)
 
 
-def settled(settings: ModelSettings, choices: Choices) -> ModelSettings:
+def apply_choices(settings: ModelSettings, choices: Choices) -> ModelSettings:
     """Return the settings with nothing left at `auto`."""
     replace = dataclasses.replace
     encoding = replace(settings.emission.encoding, kind=choices.encoding)

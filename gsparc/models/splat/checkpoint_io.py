@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gsparc.models.method import Method
 
 
-def interrupted(path: Path) -> checkpoint.Stored:
+def read_interrupted(path: Path) -> checkpoint.Stored:
     """Return what an interrupted training left.
 
     Raises:
@@ -27,8 +27,8 @@ def interrupted(path: Path) -> checkpoint.Stored:
         )
     trainer = {**stored.extra["trainer"], "earlier_s": stored.extra.get("earlier_s")}
     callbacks = trainer.pop("callbacks", None)  # whose best score begins at infinity
-    wrong = checkpoint.non_finite(trainer, "trainer")
-    wrong = wrong or checkpoint.non_finite(callbacks, "trainer.callbacks", infinite=True)
+    wrong = checkpoint.find_non_finite(trainer, "trainer")
+    wrong = wrong or checkpoint.find_non_finite(callbacks, "trainer.callbacks", infinite=True)
     if wrong is not None:
         raise checkpoint.CheckpointError(f"{path}: {wrong} is NaN or infinite; resume from an earlier file")
     return stored
@@ -60,7 +60,7 @@ class GsparcCheckpointIO(CheckpointIO):
         Raises:
             ValueError: when the file holds a finished model without a trainer's state.
         """
-        return interrupted(Path(path)).extra["trainer"]
+        return read_interrupted(Path(path)).extra["trainer"]
 
     def remove_checkpoint(self, path: Any) -> None:
         """Delete a superseded checkpoint."""

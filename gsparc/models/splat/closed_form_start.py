@@ -17,13 +17,14 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_errors
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Prior
-from gsparc.field.initial import InitTask, Start, unchanged
+from gsparc.field.initial import InitTask, Start, keep_weights
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_array_vectors
 from gsparc.models.baselines.gp import choose_kernel, principal_components
-from gsparc.models.left_out_images import LeftOut, predict_left_out
+from gsparc.models.mixture.weights import LEAST_HELD
+from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
@@ -35,7 +36,6 @@ IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap,
 CHUNK = 256  # images held as floats at a time
 KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
 COMPONENTS = 128
-LEAST_ROWS = 4  # for predictions without their neighbours to say anything
 GAPS = (0.0, 2.0, 5.0, 10.0)  # between a row and what is left, in spacings of rows
 PIXELS, CENTRES = 600, 160  # of the images, and rows, that are predicted so
 LEAST_NOISE = 1e-6  # of the kernel's variance
@@ -80,7 +80,7 @@ def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple
 
 
 @dataclass(frozen=True)
-class Seen:
+class ImageEmissions:
     """Training images as emissions of fixed footprints.
 
     Attributes:
@@ -95,10 +95,10 @@ class Seen:
     outputs: Tensor
     attenuation: Tensor | None
 
-    def at(self, rows: np.ndarray) -> Seen:
+    def at(self, rows: np.ndarray) -> ImageEmissions:
         """Return the process of some rows (m,) alone."""
         attenuation = None if self.attenuation is None else self.attenuation[rows]
-        return Seen(self.weights, self.images[rows], self.outputs[rows], attenuation)
+        return ImageEmissions(self.weights, self.images[rows], self.outputs[rows], attenuation)
 
     def rendered(self, outputs: Tensor) -> Tensor:
         """Return images (n, P) of other outputs (n, N) at the same places."""
@@ -108,7 +108,7 @@ class Seen:
 
 @torch.no_grad()
 @torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
-def warm_start(
+def solve_emissions(
     model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
 ) -> LeftOut | None:
     """Set the emission's last layer so that the model reproduces the training spectra as well as it can.
@@ -148,7 +148,7 @@ def warm_start(
     return _left_out(first, inverse, data.moving[own], mean)
 
 
-def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> Seen:
+def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> ImageEmissions:
     """Emissions (least squares) that show the images of rows (n,)."""
     gram = weights.mT @ weights
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
@@ -159,10 +159,10 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
     outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
-    return Seen(weights, images, outputs.double(), attenuation)
+    return ImageEmissions(weights, images, outputs.double(), attenuation)
 
 
-def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
+def _errors(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
     """Level and power of the `ErrorModel`: errors of rows left out one by one, and of the mean alone.
 
     Rasmussen and Williams (2006), eq. 5.12.
@@ -171,13 +171,13 @@ def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[fl
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
-    return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+    return fit_error_law(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 
 
-def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
+def _left_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
     """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
     count = len(places)
-    if count < LEAST_ROWS:
+    if count < LEAST_HELD:
         return None
     draws = np.random.default_rng(0)
     pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))
@@ -187,13 +187,15 @@ def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> 
     gaps = np.array(GAPS) * spacing
     about = (seen.outputs - mean).numpy()
     means, _ = predict_left_out(inverse.numpy(), about, distance, centres, gaps)
-    some = Seen(seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation).at(centres)
+    some = ImageEmissions(seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation).at(
+        centres
+    )
     predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())
 
 
-def prepare(task: InitTask) -> Start:
+def initialise(task: InitTask) -> Start:
     """Return the start of a task.
 
     Raises:
@@ -204,8 +206,10 @@ def prepare(task: InitTask) -> Start:
     if task.closed_form:
         assert task.receiver is not None  # else `auto_settings` refuses
         process = learn_process(task.data, task.rows, task.anchors, task.seed)
-        solve = partial(warm_start, data=task.data, rows=task.rows, receiver=task.receiver, process=process)
+        solve = partial(
+            solve_emissions, data=task.data, rows=task.rows, receiver=task.receiver, process=process
+        )
         return Start(process.prior, solve)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
     prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
-    return Start(prior, unchanged)
+    return Start(prior, keep_weights)

@@ -20,12 +20,11 @@ from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
-from gsparc.models.mixture.weights import mixed
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import averaged, mean_alone
-from gsparc.models.splat.auto_settings import resolve
+from gsparc.models.mixture.weights import mix_means
+from gsparc.models.reduced import Settings, average_with_process, without_variance
+from gsparc.models.splat.auto_settings import resolve_auto
 from gsparc.models.splat.method import LearnedField
-from gsparc.models.terms import no_array
+from gsparc.models.terms import array_obstacle
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 
@@ -63,13 +62,17 @@ class ImageProcess(LearnedField):
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
         self._average, self._average_mean = None, None
         with heeded.apart():
-            why = no_array(data.site, "rx", "the receiver moves") if self.settings.response.array else None
+            why = (
+                array_obstacle(data.site, "rx", "the receiver moves")
+                if self.settings.response.array
+                else None
+            )
             if why is not None:
                 raise ValueError(f"{self.name}: {why}")
             # Without Gaussians no step changes anything.
             if not self.settings.field.count:
                 self.most_steps = 0
-            choices, _ = resolve(self.settings, self.init.name, data.site)
+            choices, _ = resolve_auto(self.settings, self.init.name, data.site)
             log.info(
                 "training %s by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
                 GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
@@ -94,16 +97,12 @@ class ImageProcess(LearnedField):
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
-        return report.costing(Cost(spent, unused))
+        return report.with_cost(Cost(spent, unused))
 
     @property
-    def _alone(self) -> bool:
+    def _alone(self) -> bool:  # type: ignore[override]
         """Whether the averaged process has all the weight."""
         return self._average is not None and self._average[1] >= 1
-
-    def _pays(self) -> bool:
-        """Whether the rendered field is worth another stage."""
-        return not self._alone
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         if self.plain:
@@ -121,13 +120,13 @@ class ImageProcess(LearnedField):
         if self._average is None:
             return own
         if self._average_mean is None:
-            self._average_mean = mean_alone(self._average[0])
+            self._average_mean = without_variance(self._average[0])
         method, weight = self._average
         # The process without its variance is float32 and has no slopes, which float64 is asked for.
         exact = query.tx.dtype == torch.float64
         other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
         assert self.site is not None
-        return replace(own, mean=mixed(own.mean, other, weight, self.site))
+        return replace(own, mean=mix_means(own.mean, other, weight, self.site))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -143,7 +142,7 @@ class ImageProcess(LearnedField):
             return result
         assert self.site is not None
         process, weight = self._average
-        return averaged(result, process, partial(mixed, weight=weight, site=self.site))
+        return average_with_process(result, process, partial(mix_means, weight=weight, site=self.site))
 
     def size(self) -> int:
         """Return the number of Gaussians."""
@@ -155,8 +154,8 @@ class ImageProcess(LearnedField):
         weight = 0.0 if self._average is None else self._average[1]
         return super().made + (f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else "")
 
-    def field_alone(self) -> Method | None:
-        """See `Method.field_alone`."""
+    def without_process(self) -> Method | None:
+        """See `Method.without_process`."""
         if self._average is None or not super().size():
             return None
         alone = copy.copy(self)

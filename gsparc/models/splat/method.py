@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import astuple, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -21,13 +21,12 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
-from gsparc.field import edit
-from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel, fit_errors
+from gsparc.field import edit, gradient_stage
+from gsparc.field.confidence import ConfidenceSettings, fit_error_law
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
-from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
+from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.gradient_stage import run_stage, steps_asked_for
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
@@ -35,15 +34,15 @@ from gsparc.field.module import GaussianModule, LossSettings, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
+from gsparc.models.checkpoint import Stored
 from gsparc.models.fitting import Origin
-from gsparc.models.in_double import in_double
-from gsparc.models.left_out_images import LeftOut
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat import reduce
-from gsparc.models.splat.auto_settings import Choices, resolve, settled
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.models.splat.closed_form_start import prepare
+from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
+from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
+from gsparc.models.splat.closed_form_start import initialise
+from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
@@ -51,8 +50,33 @@ from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatabl
 
 log = logging.getLogger(__name__)
 
+THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a fit that begins with a fresh model, or goes on with one.
+
+    Attributes:
+        name: `train`; `refit`, as many steps again, of all rows; `final`, the start alone, of all rows.
+        fold: whose training rows it learns from.
+        context: of the fit, in the stage's folder, with what the stage goes on from.
+        steps: of gradient, of its schedule.
+        patience: see `KeepBest`.
+    """
+
+    name: Literal["train", "refit", "final"]
+    fold: Fold
+    context: FitContext
+    steps: int
+    patience: int | None = None
+
+    @property
+    def again(self) -> str:
+        """What is added to the names of its costs."""
+        return "" if self.name == "train" else " again, on all rows"
 
 
 class LearnedField(Method):
@@ -78,6 +102,7 @@ class LearnedField(Method):
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
+    _alone = False  # whether a process beside it has all the weight: another stage is worth no seconds
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -115,6 +140,7 @@ class LearnedField(Method):
         self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
+        self._earlier_s = 0.0  # of training, by the stages so far [s]
         self.frozen: FrozenView | FrozenArray | None = None
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
@@ -130,111 +156,112 @@ class LearnedField(Method):
         stage (`refit`) takes as many on training and validation rows together, because the baselines learn
         from all of them, with the confidence of the first.
         """
+        origin = Origin.of(data, fold, context)
+        left = None if context.resume is None else read_interrupted(context.resume)
+        if left is not None:
+            origin.require_same(left)
+        marks = {} if left is None else left.extra
+        budget = context.time_budget(before=Spent(*marks.get("spent", ())))
+        self._begin(data, fold, marks)
+        for stage in self._stages(data, fold, context, budget, left):
+            module = self._start(stage, data, budget)
+            if module is None:
+                continue
+            files = GsparcCheckpointIO(self, context.config_yaml, self._marks(stage, budget, origin))
+            heeded.count("dataset.batch_size")
+            began = budget.counted
+            trainer, batches = gradient_stage.make_trainer(
+                module, data, stage.fold, stage.context, files, budget, self._watch(stage)
+            )
+            with gradient_stage.interruptible(trainer, batches):
+                trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
+            self._end(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
+        self.frozen = self._doubled = None
+        what = f"final, {self.steps} of {self.steps_taken} steps kept"
+        context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
+        return FitReport(budget.counted.wall, limited_by=self._limited_by)
+
+    def _begin(self, data: Measurements, fold: Fold, marks: Mapping[str, Any]) -> None:
+        """Look at the site, and take what an interrupted run has marked; {} of a new one.
+
+        Raises:
+            ValueError: it has no such field.
+        """
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
             if np.isnan([data.tx, data.rx_position]).any():
                 lost = f"{data.site.name} does not say where its static end is"
                 raise ValueError(f"{self.name}: {lost}; take model=complex_gp")
             self._shape = (data.target.shape[1], data.target.shape[2])
-        self.choices, reasons = resolve(self.settings, self.init.name, data.site)
+        self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
-        origin = Origin.of(data, fold, context)
-        resumed = None if context.resume is None else interrupted(context.resume)
-        if resumed is not None:
-            origin.refuse_other(resumed)
-        marks = {} if resumed is None else resumed.extra
-        stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
-        budget = context.time_budget(before=Spent(*marks.get("spent", ())))
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
-        self.steps_taken = int(marks.get("taken", 0))
+        self.steps_taken, self._earlier_s = int(marks.get("taken", 0)), float(marks.get("earlier_s", 0.0))
         self.spent, self._apart = {}, _apart(data, fold)
         self._left_out = restored(marks.get("left_out"))  # an interrupted run's start is not repeated
         self._billed, self._limited_by = Spent(), marks.get("limited_by")
+
+    def _stages(
+        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, left: Stored | None
+    ) -> Iterator[Stage]:
+        """Yield one stage after the other, each decided by what came of those before.
+
+        Args:
+            left: by an interrupted run.
+        """
+        assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _more_told(data, fold, context) if few else fold
-        asked = steps_asked_for(context, len(watched.train), self.most_steps)
+        asked = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
         usual = budget.effort.steps_after_solving if solved else budget.effort.steps
         steps = usual if asked is None else asked
         log.info(
             "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
             "in closed form" if solved else f"from init={self.choices.init}",
         )  # fmt: skip
-        watching = not self.keep_best or len(watched.val) > 0 or not solved
-        if stage == "train":
+        refits = left is not None and left.extra.get("stage") == "refit"
+        if left is not None and refits:
+            self.restore(data.site, left.state)
+        else:
+            watching = not self.keep_best or len(watched.val) > 0 or not solved
             if steps and watching:
                 # Steps that somebody asks for are all taken.
-                patience = PATIENCE if asked is None else None
-                seconds += self._stage(
-                    "train", origin, data, watched, context, budget, seconds, steps, patience
-                )
+                yield Stage("train", watched, context, steps, PATIENCE if asked is None else None)
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
-                return self._end_with_start(origin, data, fold, context, budget, seconds)
+                # No step was surely better, or none was asked for: the start, solved again on all rows.
+                self.steps, every = 0, _all_rows(fold) if self.refit else fold
+                yield Stage("final", every, replace(context, resume=None), 0)
+                self._weigh_process(data, every)
+                return
             if not steps:
-                self._stage("train", origin, data, watched, context, budget, seconds, 0)
+                yield Stage("train", watched, context, 0)
             self._calibrate(data, watched)
             self._weigh_process(data, watched)
-        elif resumed is not None:
-            self.restore(data.site, resumed.state)
-        if self.refit and len(watched.val) and self._pays() and not budget.over():
-            every = Fold(np.sort(np.concatenate([watched.train, watched.val])), fold.val[:0], fold.test)
-            resume = context.resume if stage == "refit" else None
-            again = context.within("refit", resume=resume)
-            known = self.fitted().confidence, self.fitted().error
-            kept = self.model, self.steps, self._prior
-            self._stage("refit", origin, data, every, again, budget, seconds, steps, None, *known)
-            if budget.limited and stage == "train":  # its schedule is cut: the first stage ended its own
+        if self.refit and len(watched.val) and not self._alone and not budget.over():
+            kept, resume = (self.model, self.steps, self._prior), context.resume if refits else None
+            yield Stage("refit", _all_rows(watched), context.within("refit", resume=resume), steps)
+            if budget.limited and not refits:  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
-        return self._ended(context, budget)
 
-    def _end_with_start(
-        self, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, seconds: float,
-    ) -> FitReport:  # fmt: skip
-        """Solve the start again on all rows: no step was surely better, or none was asked for."""
-        every = np.sort(np.concatenate([fold.train, fold.val]))
-        fold = Fold(every, fold.val[:0], fold.test) if self.refit else fold
-        self.steps, again = 0, replace(context, resume=None)
-        self._stage("final", origin, data, fold, again, budget, seconds, 0)
-        self._weigh_process(data, fold)
-        return self._ended(context, budget)
+    def _start(self, stage: Stage, data: Measurements, budget: TimeBudget) -> GaussianModule | None:
+        """Make a fresh model, or read one back; return what trains it, None where no step is taken.
 
-    def _ended(self, context: FitContext, budget: TimeBudget) -> FitReport:
-        self.frozen = self._doubled = None
-        what = f"final, {self.steps} of {self.steps_taken} steps kept"
-        context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
-        return FitReport(budget.counted.wall, limited_by=self._limited_by)
-
-    def _pays(self) -> bool:
-        """Whether another stage is worth its seconds."""
-        return True
-
-    def _stage(
-        self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        budget: TimeBudget, earlier_s: float, steps: int, patience: int | None = None,
-        confidence: Confidence | None = None, error: ErrorModel | None = None,
-    ) -> float:  # fmt: skip
-        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
-
-        Args:
-            stage: `train`, `refit` or `final`, which takes no steps.
-            steps: of the schedule.
-            patience: see `KeepBest`.
-            confidence, error: of an earlier stage, told by rows that this one learns from.
+        What an earlier stage learned of errors is kept by `refit`, which learns from the rows that told it.
         """
-        folder, resume = context.run_dir, context.resume
+        context, folder = stage.context, stage.context.run_dir
         L.seed_everything(context.seed, verbose=False)
-        started = budget.counted
+        started, before = budget.counted, self.model
         assert self.choices is not None
-        if context.init_from is not None and resume is None:
+        if context.init_from is not None and context.resume is None:
             self._start_from(data.site, context.init_from)
-        elif resume is None:
-            start = prepare(
+        elif context.resume is None:
+            start = initialise(
                 InitTask(
-                    settled(self.settings, self.choices), self.choices.closed_form, data,
-                    fold.train, self._receiver(), self._ends.get("tx_position"),
+                    apply_choices(self.settings, self.choices), self.choices.closed_form, data,
+                    stage.fold.train, self._receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
             )  # fmt: skip
@@ -246,48 +273,57 @@ class LearnedField(Method):
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
             self._billed = Spent(*start.billed_s)
         else:
-            self.restore(data.site, checkpoint.read(resume).state)
-        if confidence is not None:
-            self.fitted().confidence = confidence.requires_grad_(False)
-        if error is not None:
-            self.fitted().error = error
+            self.restore(data.site, checkpoint.read(context.resume).state)
+        if stage.name == "refit":
+            assert before is not None
+            self.fitted().confidence, self.fitted().error = before.confidence, before.error
+            if before.confidence is not None:
+                before.confidence.requires_grad_(False)
         prepared = (budget.counted - started).wall
-        self.init_s = (self.init_s or 0.0) + prepared
-        again = "" if stage == "train" else " again, on all rows"
-        self.spent["initialiser" + again] = prepared
-        if not steps:
-            return prepared
+        self.init_s, self._earlier_s = (self.init_s or 0.0) + prepared, self._earlier_s + prepared
+        self.spent["initialiser" + stage.again] = prepared
+        if not stage.steps:
+            return None
         if budget.over():
             log.warning("budget_s=%.3g: none is left for gradient steps", context.budget_s)
-            blind = stage == "train" and self.choices.closed_form  # nothing shows that steps would gain
+            blind = stage.name == "train" and self.choices.closed_form  # nothing shows that steps would gain
             self._paying = 0 if blind else self._paying
         if self._paying == 0:
             self.steps = 0
-            return prepared
-        module = self.module(steps, folder)
-        module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
+            return None
+        module = self.module(stage.steps, folder)
+        module.prepared_seconds, module.solved = self._earlier_s, self.choices.closed_form
         module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
-        marks = {
-            "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
+        return module
+
+    def _marks(self, stage: Stage, budget: TimeBudget, origin: Origin) -> dict[str, Any]:
+        """What `_begin` reads of a run that is interrupted in a stage."""
+        return {
+            "stage": stage.name, "earlier_s": self._earlier_s, "spent": astuple(budget.counted),
             "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
             "left_out": stored(self._left_out), **origin.marks(),
         }  # fmt: skip
-        files = GsparcCheckpointIO(self, context.config_yaml, marks)
-        watch: list[L.Callback] = []
-        if self.keep_best and stage == "train":
-            watch.append(KeepBest(patience))
-        if stage == "refit" and self._paying is not None:
-            watch.append(StopAt(self._paying))
-        heeded.count("dataset.batch_size")
-        ran = run_stage(module, data, fold, context, files, budget, watch)
-        self.steps = ran.taken if ran.kept is None else ran.kept
-        self.spent["gradient steps" + again] = ran.seconds
-        if ran.timed_out or budget.limited:
-            self._limited_by = less_repeatable(self._limited_by, "wall" if ran.timed_out else budget.clock)
-        if stage == "train":
-            self._paying, self.steps_taken = ran.kept, ran.taken
-        return prepared + ran.seconds
+
+    def _watch(self, stage: Stage) -> list[L.Callback]:
+        """Callbacks that say which steps are kept."""
+        if stage.name == "train":
+            return [KeepBest(stage.patience)] if self.keep_best else []
+        return [] if self._paying is None else [StopAt(self._paying)]
+
+    def _end(
+        self, stage: Stage, result: gradient_stage.TrainerResult, began: Spent, budget: TimeBudget
+    ) -> None:
+        """Note what the steps of a stage were worth."""
+        seconds = (budget.counted - began).wall
+        self._earlier_s += seconds
+        self.steps = result.taken if result.kept is None else result.kept
+        self.spent["gradient steps" + stage.again] = seconds
+        if result.timed_out or budget.limited:
+            clock: Clock = "wall" if result.timed_out else budget.clock
+            self._limited_by = less_repeatable(self._limited_by, clock)
+        if stage.name == "train":
+            self._paying, self.steps_taken = result.kept, result.taken
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         """A hook between the stages: what a process averaged with the field would gain."""
@@ -324,7 +360,7 @@ class LearnedField(Method):
 
     def _new_model(self, site: Site) -> GaussianModel:
         assert self.choices is not None
-        settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
+        settings, transmitter = apply_choices(self.settings, self.choices), self._ends.get("tx_position")
         return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
 
     @torch.no_grad()
@@ -339,7 +375,7 @@ class LearnedField(Method):
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
-            model.error.set(*fit_errors(result.unknown.numpy(), error.double().numpy()))
+            model.error.set(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -381,7 +417,7 @@ class LearnedField(Method):
         frozen = seen if isinstance(seen, FrozenArray) else None
         of = int(model.gaussians.version), frozen is None
         if self._doubled is None or self._doubled[0] != of:
-            self._doubled = of, in_double((model, frozen))
+            self._doubled = of, to_double((model, frozen))
         return self._doubled[1]
 
     def _answered(
@@ -405,7 +441,7 @@ class LearnedField(Method):
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None
         if self.frozen is None or self.frozen.version != int(model.gaussians.version):
-            self.frozen = frozen_view(model, rx)
+            self.frozen = freeze_view(model, rx)
         return self.frozen
 
     @torch.no_grad()
@@ -420,11 +456,11 @@ class LearnedField(Method):
 
     # -- what it can do besides ----------------------------------------------------------------------
 
-    def knobs(self) -> tuple[str, ...]:
+    def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduced`."""
-        return reduce.knobs(self.fitted())
+        return reduce.reduction_settings(self.fitted())
 
-    contributions = reduce.contributions
+    reduction_inputs = reduce.reduction_inputs
     reduced = reduce.reduced
 
     # -- storing -----------------------------------------------------------------------------------
@@ -448,7 +484,7 @@ class LearnedField(Method):
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site)
-        edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
+        edit.resize_gaussians(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
         self.frozen = self._doubled = None
 
@@ -483,12 +519,17 @@ class LearnedField(Method):
         }  # fmt: skip
 
 
+def _all_rows(fold: Fold) -> Fold:
+    """Training and validation rows as training rows."""
+    return Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+
+
 def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
     known = np.sort(np.concatenate([fold.train, fold.val]))
-    if len(known) < 3 * LEAST_HELD:
+    if len(known) < THIRDS * LEAST_HELD:
         return fold
-    cut = cut_inner_folds(data, fold, context.split, 3, context.seed).folds[0]
+    cut = cut_inner_folds(data, fold, context.split, THIRDS, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 

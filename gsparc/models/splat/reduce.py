@@ -13,12 +13,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import PositionEncoding, Prior
-from gsparc.field.frozen import FrozenArray, frozen_array
+from gsparc.field.frozen import FrozenArray, freeze_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.method import Method
-from gsparc.models.pareto import Settings
-from gsparc.models.reduced import Filled, coarser
+from gsparc.models.reduced import Interpolated, Settings, coarsen_grid
 from gsparc.ops import Pose, SphereGrid
 from gsparc.processes.features import correlation, pivoted_rows, with_places
 
@@ -31,7 +30,7 @@ def through_array(model: GaussianModel) -> bool:
     return model.settings.response.array
 
 
-def knobs(model: GaussianModel) -> tuple[str, ...]:
+def reduction_settings(model: GaussianModel) -> tuple[str, ...]:
     """See `Method.reduced`.
 
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
@@ -42,12 +41,13 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
     return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
 
 
-def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+def reduction_inputs(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
     """Return `receiver` (4, 3), a static one's position [m] above its rotation; else nothing."""
     if method.fitted().site.static_end != "rx":
         return {}
     rx = data.batch(rows[:1]).rx
-    return {"receiver": torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])}
+    pose = rx[0] if rx.batched else rx
+    return {"receiver": torch.cat([pose.position[None], pose.rotation])}
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
@@ -72,7 +72,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     model.gaussians.version += 1  # a plan frozen before is stale
     if by_places:
         twin.frozen, grid = _frozen_again(method, model, measured["receiver"], stride)
-        return Filled(twin, grid, stride) if stride > 1 else twin
+        return Interpolated(twin, grid, stride) if stride > 1 else twin
     if stride == 1:
         return twin
     if site.kind != "spectrum":  # visibility is measured on fewer directions, nothing to fill in
@@ -80,8 +80,8 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
         model.site = replace(site, grid=SphereGrid.full_sphere(rows, 2 * rows))
         return twin
     assert site.grid is not None
-    model.site = replace(site, grid=coarser(site.grid, stride))
-    return Filled(twin, site.grid, stride)
+    model.site = replace(site, grid=coarsen_grid(site.grid, stride))
+    return Interpolated(twin, site.grid, stride)
 
 
 def _frozen_again(
@@ -94,8 +94,8 @@ def _frozen_again(
     view = method.frozen_at(Pose(receiver[0], receiver[1:]))
     response, grid = model.response, model.site.grid
     assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
-    renderer = response.every(stride, coarser(grid, stride)) if stride > 1 else None
-    return frozen_array(model, view.view, renderer), grid
+    renderer = response.every(stride, coarsen_grid(grid, stride)) if stride > 1 else None
+    return freeze_array(model, view.view, renderer), grid
 
 
 @torch.no_grad()

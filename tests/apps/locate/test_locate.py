@@ -38,7 +38,7 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
     with caplog.at_level(logging.WARNING):
         before = locate(predictor, spectrum)[0]
     assert "never calibrated" in caplog.text
-    checkpoint.amend(trained, trust_state(Trust(spread=0.2), Nuisances(), 0.9))
+    checkpoint.update_extra(trained, trust_state(Trust(spread=0.2), Nuisances(), 0.9))
     after = locate(gsparc.load(trained), spectrum)[0]
     assert after.area > 2 * before.area
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):

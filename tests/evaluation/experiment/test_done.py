@@ -12,7 +12,7 @@ from campaigns import compose, spectra
 from omegaconf import OmegaConf
 
 import gsparc
-from gsparc.commands.train import begin
+from gsparc.commands.train import read_inputs
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.evaluation.experiment.done import (
@@ -22,6 +22,7 @@ from gsparc.evaluation.experiment.done import (
     measurements_hash,
     package_hash,
     read_finished,
+    recorded,
     run_once,
     strip_comments,
 )
@@ -112,7 +113,7 @@ def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_pat
 def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
-    begun = begin(config)
+    begun = read_inputs(config)
     return State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
 
 
@@ -151,7 +152,8 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     file, read = spectra(tmp_path / "own.npz"), state()
     configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
     unread, same, other = map(State.unread, configs)
-    run_once(tmp_path, read, ends(tmp_path), unread=unread)
+    with recorded(tmp_path, read, unread) as left:
+        ends(tmp_path)(left)
     assert read_finished(tmp_path, same) == {"value": 1} and read_finished(tmp_path, other) is None
     with file.open("ab") as stream:
         stream.write(b" ")

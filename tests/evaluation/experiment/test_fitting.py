@@ -6,7 +6,7 @@ import pytest
 from hydra import initialize_config_module
 
 from gsparc.evaluation.experiment.cells import Cell, Contender
-from gsparc.evaluation.experiment.fitting import Filled, fill_all, prepare
+from gsparc.evaluation.experiment.fitting import CellResult, prepare_cell, run_cells
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
 from gsparc.models.checkpoint import CheckpointError
@@ -19,7 +19,9 @@ def problem(campaign, folds):
 
 def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
     """Times that a comparison had kept stood in tables of other programs' models."""
-    assert time_by_dataset([Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})], {}) == {}
+    assert (
+        time_by_dataset([CellResult(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})], {}) == {}
+    )
 
 
 def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose=()):
@@ -27,7 +29,7 @@ def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=Non
     contender = Contender(model, (f"model={model}", *choose), ("budget_s={budget_s}",))
     cell = Cell("own", "random", model, budget_s, seed)
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        return prepare(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
+        return prepare_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_a_full_disk_ends_a_comparison(problem, tmp_path):
 
     cells = [prepared(problem, tmp_path, method) for method in ("mean", "gp")]
     with pytest.raises(CheckpointError, match="cannot be written"):
-        fill_all(cells, full)
+        run_cells(cells, full)
     assert len(tried) == 1
 
 

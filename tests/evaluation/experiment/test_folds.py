@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsparc.evaluation.experiment.folds import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -15,9 +15,9 @@ def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, 
     kept = []
 
     def outcome():
-        context = in_folders(FitContext(tmp_path), split)
+        context = fold_contexts(FitContext(tmp_path), split)
         keep = lambda number, *unused: kept.append(number)  # noqa: E731
-        return fit_folds(method_class("gp")(), data, split, context, keep=keep).scored_on(data, split)
+        return fit_folds(method_class("gp")(), data, split, context, keep=keep).with_scores(data, split)
 
     here = outcome()
     elsewhere("joblib")

@@ -8,7 +8,7 @@ from clocks import WoundClock
 
 from gsparc.evaluation.experiment import latency
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models.method import Prediction
 from gsparc.prediction import timing
@@ -41,7 +41,7 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
     monkeypatch.setattr(latency, "FAST", replace(latency.FAST, rounds=12))
     problem = Problem("toy", "random", (), campaign("spectrum", 20), folds(20))
-    cells = [Filled(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
+    cells = [CellResult(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
     found = latency.time_queries(cells, problem)
     assert list(found) == list(WAITS)
     assert {name: one.rounds for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}

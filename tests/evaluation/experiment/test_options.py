@@ -18,8 +18,8 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.folds import context_of, fit_folds
-from gsparc.models.registry import build, complete
+from gsparc.evaluation.experiment.folds import fit_context, fit_folds
+from gsparc.models.registry import build, fill_defaults
 
 WORLDS = {
     "array": World("array", 1, 1, "tx", "metres", "none", "random", 30),
@@ -47,7 +47,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
     config = OmegaConf.masked_copy(whole, [key for key in whole if key != "hydra"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HydraConfig.instance(), "cfg", whole)
-        method = build(complete(config.model))
+        method = build(fill_defaults(config.model))
         reads = options.options_to_note(config, method)
         with heeded.recording(reads):
             data = datamodule(config.dataset).measurements
@@ -55,7 +55,7 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
             folder = Path(mkdtemp())
             fits = fit_folds(
                 method, data, split,
-                [context_of(config, run_dir=folder)] * len(split.folds),
+                [fit_context(config, run_dir=folder)] * len(split.folds),
             )  # fmt: skip
             method, rows = fits.methods[0], split.folds[0].test
             method.predict(data.batch(rows[:1]))

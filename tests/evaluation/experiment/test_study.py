@@ -10,7 +10,7 @@ from invented import divide, invent
 from gsparc.data.query import Batch
 from gsparc.evaluation.experiment import study
 from gsparc.evaluation.experiment.done import State
-from gsparc.evaluation.experiment.folds import fit_folds, in_folders
+from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.experiment.study import DataChanges, Study
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
@@ -32,7 +32,7 @@ def run(monkeypatch, tmp_path):
         study.checkpoint, "save", lambda path, method, *more: kept.update({str(path): method})
     )
     monkeypatch.setattr(study.checkpoint, "read", kept.get)
-    monkeypatch.setattr(study.loading, "made_again", lambda factory, stored: stored)
+    monkeypatch.setattr(study.loading, "rebuild_method", lambda factory, stored: stored)
     context = FitContext(tmp_path, seed=5, budget_s=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 
@@ -122,9 +122,9 @@ def test_more_measurements_are_better_and_are_counted(run):
 def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
     data, split = invent("csi"), divide(48, 3)
     kept = []
-    contexts = in_folders(FitContext(tmp_path), split)
+    contexts = fold_contexts(FitContext(tmp_path), split)
     fits = fit_folds(Nearest(), data, split, contexts, keep=lambda *given: kept.append(given))
     assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
-    found = fits.scored_on(data, split)
+    found = fits.with_scores(data, split)
     assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3
     assert found.figures["samples"] == 48

@@ -5,7 +5,7 @@ import pytest
 
 from gsparc.evaluation.experiment import pictures
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.fitting import Filled
+from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.experiment.pictures import draw_budgets
 from gsparc.evaluation.experiment.table import (
@@ -27,7 +27,7 @@ def filled(method, value, seed=None, budget=None, split="random", kind="spectrum
     }  # fmt: skip
     drawn, earlier = more.pop("drawn", False), more.pop("earlier", "")
     cell = Cell("rfid", split, method, budget, seed)
-    return Filled(cell, None, facts | {"dataset/kind": kind} | more, drawn, earlier)
+    return CellResult(cell, None, facts | {"dataset/kind": kind} | more, drawn, earlier)
 
 
 FOUND = [

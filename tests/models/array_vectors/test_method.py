@@ -15,7 +15,7 @@ from gsparc.data.load import load, split_for
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.evaluation.scores import score_methods
-from gsparc.field.confidence import fit_errors
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models.array_vectors import splat_init
@@ -122,7 +122,7 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     chosen = choose_kernel(
         scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array)
     )
-    a, b = fit_errors(chosen.unknown, chosen.error)
+    a, b = fit_error_law(chosen.unknown, chosen.error)
     assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
     assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
 

@@ -13,7 +13,7 @@ from known_arrays import spectra
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.field.frozen import seen_by_array
+from gsparc.field.frozen import gaussian_vectors
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached
@@ -28,7 +28,7 @@ def _trained(data, fold, folder, *overrides: str, steps: int = 10):
     factory = build(
         compose("logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides).model
     )
-    method = factory.made_for(data)
+    method = factory.create_for(data)
     method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
     return method
 
@@ -61,7 +61,7 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     model, batch = method.fitted(), data.batch(fold.test)
     mean, variance = process
     emitted = torch.view_as_complex(model.features(batch.tx, batch.rx).contiguous()).detach()
-    vectors = (emitted @ seen_by_array(model, batch.rx)).numpy()
+    vectors = (emitted @ gaussian_vectors(model, batch.rx)).numpy()
     # One phase is common to all vectors and known to nobody.
     turn = np.vdot(vectors, mean) / abs(np.vdot(vectors, mean))
     assert np.linalg.norm(vectors * turn - mean) < 2e-3 * np.linalg.norm(mean)
@@ -132,9 +132,9 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     data, _ = known_campaign
     found = splat_init.learn_vector_process(data, np.arange(20), 1024, 0, tmp_path)
     method, _, _ = trained
-    model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model).made_for(
-        data
-    )
+    model = build(
+        compose("model.effects.array=true", "model.effects.residual=false", COUNT).model
+    ).create_for(data)
     model.restore(data.site, method.state())
     with torch.no_grad():
         model.fitted().gaussians.opacity_logits.fill_(-40.0)

@@ -21,7 +21,7 @@ from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage,
 from gsparc.models.channels.terms.term import Frame
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -98,7 +98,7 @@ def test_one_field_of_all_ends_is_better_than_plain_processes():
     fold = fold_of(data)
     field, notes = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
     assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)
-    plain = for_stations(ComplexGP(), data)
+    plain = by_station(ComplexGP(), data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
 
@@ -164,9 +164,9 @@ def test_there_and_back_with_angles_to_ends(tmp_path):
 def test_stations_together_are_asked_for_any_pair():
     data = _ceiling(ends=4, count=36)
     rows = np.flatnonzero(data.station < 3)
-    method = for_stations(Gsparc(), data)
+    method = by_station(Gsparc(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
-    again = for_stations(Gsparc(), data)
+    again = by_station(Gsparc(), data)
     again.restore(data.site, method.state())
     places = data.site.stations.position + data.site.origin
     here = np.array([0.3, 0.3, 0.2])
@@ -183,7 +183,7 @@ def test_stations_together_are_asked_for_any_pair():
 def test_methods_of_one_end_are_refused_as_before():
     data = _ceiling(ends=3, count=30)
     rows = np.arange(len(data))
-    fold, method = Fold(rows, rows[:0], rows[:0]), for_stations(ImageSourceGP(), data)
+    fold, method = Fold(rows, rows[:0], rows[:0]), by_station(ImageSourceGP(), data)
     with pytest.raises(ValueError, match="stations=each"):
         method.fit(data, fold, FitContext(stations="together"))
 
@@ -199,7 +199,7 @@ def test_measured_ceiling_in_squares():
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
-    plain = for_stations(ComplexGP(), data)
+    plain = by_station(ComplexGP(), data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.55 * answer_error(plain, data, fold.test)
 
@@ -209,7 +209,7 @@ def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
     """Rows of a later station carry its number, of which a site of one end knew nothing."""
     data = _ceiling(ends=2, count=30)
     fold = fold_of(data)
-    method = for_stations(Gsparc(EffectSettings(phase=False)), data)
+    method = by_station(Gsparc(EffectSettings(phase=False)), data)
     method.fit(data, fold, FitContext(stations="each"))
     batch = data.batch(fold.test)
     by_place, by_row = method.predict(Query(batch.tx, batch.rx)), method.predict(batch)

@@ -24,7 +24,7 @@ from gsparc.models.mixture.methods import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.training import race
 from gsparc.training.context import FitContext
-from gsparc.training.race import Behind, Race
+from gsparc.training.race import FellBehind, Race
 
 
 def _predicted(method, data, index):
@@ -135,7 +135,7 @@ def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, m
     group, looks = fold.train[::3], []
     target = data.batch(group).target
     another = Race.of(group, 1.1 * target, target, lambda *look: looks.append(look))
-    with pytest.raises(Behind, match="of the energy of rows held out"):
+    with pytest.raises(FellBehind, match="of the energy of rows held out"):
         method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=another))
     assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
 

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from gsparc.models.mixture.weights import (
-    Rows,
+    HeldOutPair,
     best_weights,
     choose_weights,
-    comparable,
-    error,
-    explained,
-    mixed,
-    paired,
+    explained_variance,
+    in_error_unit,
+    mean_and_error,
+    mix_means,
+    mixture_errors,
+    relative_error,
     share_of_second,
-    squared,
-    weights,
+    stacking_weights,
 )
 
 EACH = np.arange(50)  # every row is a unit
@@ -30,56 +30,61 @@ def noisy(share: float, seed: int) -> torch.Tensor:
 
 
 def test_equal_errors_share_and_large_ones_have_nothing():
-    found = weights([noisy(0.3, 1), noisy(0.3, 2), noisy(5.0, 3)], TARGET, EACH)
+    found = stacking_weights([noisy(0.3, 1), noisy(0.3, 2), noisy(5.0, 3)], TARGET, EACH)
     assert sum(found) == pytest.approx(1) and found[2] == 0
     assert found[0] == pytest.approx(0.5, abs=0.1)
 
 
 def test_one_far_ahead_predicts_alone():
-    assert weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET, EACH) == (1.0, 0.0)
+    assert stacking_weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET, EACH) == (1.0, 0.0)
 
 
 def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
-    few = weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
-    assert few == (1.0, 0.0) and 0 < weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
+    few = stacking_weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
+    assert (
+        few == (1.0, 0.0)
+        and 0 < stacking_weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
+    )
 
 
 def test_rows_of_one_unit_do_not_make_a_mixture():
     """One square of floor: whichever mixture fits it says nothing about the next."""
-    assert sorted(weights([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
+    assert sorted(stacking_weights([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
 
 
 def test_complex_predictions_are_weighed_as_they_are_summed():
     turned = torch.complex(noisy(0.3, 1), noisy(0.3, 2))
     other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
     target = torch.complex(TARGET, TARGET)
-    found = weights([turned, other], target, EACH)
+    found = stacking_weights([turned, other], target, EACH)
     both = found[0] * turned + found[1] * other
-    assert error(both, target) < min(error(turned, target), error(other, target))
+    assert relative_error(both, target) < min(relative_error(turned, target), relative_error(other, target))
 
 
 def test_powers_that_are_weighed_in_decibels_were_averaged_as_such():
     site = SimpleNamespace(kind="rssi")
     own, other = torch.tensor([1e-6]), torch.tensor([1e-10])
-    assert float(comparable(mixed(own, other, 0.25, site), site)) == pytest.approx(-70)
-    assert float(mixed(own, other, 0.25, SimpleNamespace(kind="csi"))) == pytest.approx(0.75e-6, rel=1e-4)
+    assert float(in_error_unit(mix_means(own, other, 0.25, site), site)) == pytest.approx(-70)
+    assert float(mix_means(own, other, 0.25, SimpleNamespace(kind="csi"))) == pytest.approx(0.75e-6, rel=1e-4)
 
 
 def test_silent_targets_still_give_weights():
-    assert sum(weights([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)) == pytest.approx(1)
+    assert sum(
+        stacking_weights([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)
+    ) == pytest.approx(1)
 
 
 def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channels():
-    assert explained(torch.zeros_like(TARGET) + TARGET.mean(0), TARGET, True) == pytest.approx(0)
-    assert explained(TARGET, TARGET, False) == 1
-    assert explained(torch.zeros_like(TARGET), TARGET, False) == 0
+    assert explained_variance(torch.zeros_like(TARGET) + TARGET.mean(0), TARGET, True) == pytest.approx(0)
+    assert explained_variance(TARGET, TARGET, False) == 1
+    assert explained_variance(torch.zeros_like(TARGET), TARGET, False) == 0
 
 
-def rows(own: float, plain: float, count: int, seed: int = 0) -> Rows:
+def rows(own: float, plain: float, count: int, seed: int = 0) -> HeldOutPair:
     draws = np.random.default_rng(seed)
     target = draws.uniform(0, 1, (count, 40))
     noise = draws.standard_normal((2, count, 40))
-    return Rows(target + own * noise[0], target + plain * noise[1], target)
+    return HeldOutPair(target + own * noise[0], target + plain * noise[1], target)
 
 
 def test_the_second_has_the_weight_of_largest_psnr():
@@ -100,9 +105,9 @@ def test_few_rows_that_do_not_tell_two_apart_weigh_them_alike():
     rng = np.random.default_rng(0)
     target = rng.normal(size=(16, 50))
     alike = [target + rng.normal(size=(16, 50)) for _ in range(2)]
-    assert share_of_second([Rows(*alike, target)]) == 0.5
-    assert share_of_second([Rows(target + 0.01, alike[1], target)]) == 0.0
-    assert share_of_second([Rows(alike[0], target + 0.01, target)]) == 1.0
+    assert share_of_second([HeldOutPair(*alike, target)]) == 0.5
+    assert share_of_second([HeldOutPair(target + 0.01, alike[1], target)]) == 0.0
+    assert share_of_second([HeldOutPair(alike[0], target + 0.01, target)]) == 1.0
 
 
 def gram_of(errors: np.ndarray) -> np.ndarray:
@@ -137,18 +142,18 @@ def test_weights_are_the_best_of_a_grid():
 
 def test_rows_of_one_unit_count_as_one():
     difference = np.repeat(np.random.default_rng(0).normal(size=20), 10)
-    alone = paired(difference, np.arange(200))[1]
-    together = paired(difference, np.repeat(np.arange(20), 10))[1]
+    alone = mean_and_error(difference, np.arange(200))[1]
+    together = mean_and_error(difference, np.repeat(np.arange(20), 10))[1]
     assert together == pytest.approx(difference[::10].std(ddof=1) / np.sqrt(20), rel=0.03)
     assert together > 3 * alone
-    assert paired(difference, np.zeros(200)) == (pytest.approx(difference.mean()), np.inf)
+    assert mean_and_error(difference, np.zeros(200)) == (pytest.approx(difference.mean()), np.inf)
 
 
 def test_a_mixture_is_taken_where_it_pays():
     errors = drawn([1.0, 1.05])
     weights = choose_weights(gram_of(errors), np.arange(400))
     assert weights == pytest.approx([0.5, 0.5], abs=0.1)
-    assert squared(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
+    assert mixture_errors(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
 
 
 @pytest.mark.parametrize("deviations,common", [([1.0, 5.0], 0.0), ([0.1, 0.1], 1.0)])

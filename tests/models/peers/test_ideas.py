@@ -12,8 +12,8 @@ from scipy.special import eval_legendre
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.query import Query
 from gsparc.models.baselines.kriging import fit_variogram
-from gsparc.models.peers.gsrf import fourier_legendre, terms
-from gsparc.models.peers.newrf import virtual_transmitters
+from gsparc.models.peers.gsrf import count_terms, fourier_legendre
+from gsparc.models.peers.newrf import locate_transmitters
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.training.context import FitContext
@@ -29,7 +29,7 @@ def fitted(name, data, fold, tmp_path, **settings):
 def test_fourier_legendre_is_what_it_says():
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     series = fourier_legendre(directions, 4, 3)
-    assert series.shape == (50, terms(4, 3))
+    assert series.shape == (50, count_terms(4, 3))
     x, y, z = directions.numpy().T
     wanted = eval_legendre(4, z) * np.sin(2 * np.arctan2(y, x))
     assert np.allclose(series[:, 4 * 7 + 4], wanted)
@@ -114,7 +114,7 @@ def test_rays_that_meet_by_chance_are_no_virtual_transmitter():
     for i in (0, np.linalg.norm(data.rx_position[1:] - data.rx_position[0], axis=1).argmin() + 1):
         towards = sources.mean(0) + np.array([0.3, 0.2, 0.1]) - data.rx_position[i]
         rays[i] = np.vstack([rays[i], towards / np.linalg.norm(towards)])
-    found, seen = virtual_transmitters(data.rx_position, rays)
+    found, seen = locate_transmitters(data.rx_position, rays)
     nearest = np.linalg.norm(found[:, None] - sources[None], axis=-1)
     assert (nearest.min(0) < 0.02).all(), "every image is found"
     assert (nearest.min(1) < 0.02).all(), "and what is found is an image"

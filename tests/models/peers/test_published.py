@@ -7,7 +7,7 @@ import torch
 from published_table import FILE, settings, table
 from scenes import lobes
 
-from gsparc.models.peers.nerf2 import REFERENCE, NeRF2
+from gsparc.models.peers.nerf2 import REFERENCE, MarchedField, NeRF2
 from gsparc.models.peers.trained import _scene
 
 
@@ -19,7 +19,7 @@ def test_the_table_says_which_settings_are_the_papers():
 @pytest.fixture
 def published(tmp_path):
     data, fold = lobes(tmp_path)
-    return NeRF2(**settings("paper", "nerf2")).build(_scene(data, fold.train), {}), data.batch(fold.test)
+    return MarchedField(_scene(data, fold.train), NeRF2(**settings("paper", "nerf2"))), data.batch(fold.test)
 
 
 def test_published_nerf2_was_two_networks_of_eight_layers(published):

@@ -18,7 +18,7 @@ from scenes import lobes, room
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.evaluation.experiment.folds import callbacks_of
+from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint, loading
@@ -93,8 +93,8 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.field.optimizer.rate_factor", noted)
     for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 0)):
         method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
-        build = method.build
-        method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
+        build = method.makes
+        method.makes = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
         seen.clear()
         report = method.fit(data, fold, FitContext(tmp_path))
         assert report.limited_by == ("processor" if slow_s > 1 else None)
@@ -110,8 +110,8 @@ def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, mon
     clock, weights = wound(monkeypatch).process_time, []
     for slow_s in (0.0, 0.2, 9.0):
         method = brief("swiftwrf", budget_s=1.0)
-        build = method.build
-        method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
+        build = method.makes
+        method.makes = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
         report = method.fit(data, fold, FitContext(tmp_path))
         assert report.limited_by == ("processor" if slow_s > 1 else None)
         assert method.steps == (0 if slow_s > 1 else 3)
@@ -138,7 +138,7 @@ def test_peers_had_loops_of_their_own(tmp_path):
 
     def taught(folder, *more, **given):
         method, trainer = brief("nerf2", max_steps=99), partial(DEFAULTS, max_steps=30, log_every_n_steps=10)
-        callbacks = [*callbacks_of(compose("model=nerf2").callbacks), *more]
+        callbacks = [*build_callbacks(compose("model=nerf2").callbacks), *more]
         context = FitContext(tmp_path / folder, trainer=trainer, callbacks=lambda: callbacks, **given)
         return method, method.fit(data, fold, context)
 

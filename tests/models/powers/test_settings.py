@@ -17,8 +17,8 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _in_doubt, fit_powers
-from gsparc.models.reduced import reduced
-from gsparc.models.target_rows import rows_of
+from gsparc.models.reduced import reduce_method
+from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.powers import Rows
@@ -73,7 +73,7 @@ def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
         still = np.append(stored["station_position"][station], 0.0)
     known = {"rx_position": places, "tx_position": still, "rssi_db": decibels[rows]}
     data = from_arrays(known, {"name": "city"})
-    process, _ = fit_powers(rows_of(data, np.arange(97)), data.site)
+    process, _ = fit_powers(power_rows(data, np.arange(97)), data.site)
     assert process.kernel.amplitude < 3 * decibels[rows].var()  # 6.6 times without the bound
 
 
@@ -114,8 +114,8 @@ def test_intervals_cover_what_they_promise():
 def test_a_mean_alone_has_no_variance():
     data, method = town(120), GaussianProcess()
     batch, _ = fit(method, data, 100)
-    lean = reduced(method, {"confidence": False}, {}).predict(batch)
-    assert lean.variance is None and method.knobs() == ("confidence",)
+    lean = reduce_method(method, {"confidence": False}, {}).predict(batch)
+    assert lean.variance is None and method.reduction_settings() == ("confidence",)
     assert torch.allclose(lean.mean, method.predict(batch).mean, rtol=1e-5)
 
 
@@ -167,7 +167,7 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
     )
     arrays = {"rx_position": places, "tx_position": station, "rssi_db": decibels}
     data = from_arrays(arrays, {"name": "street"})
-    process, notes = fit_powers(rows_of(data, np.arange(80)), data.site)
+    process, notes = fit_powers(power_rows(data, np.arange(80)), data.site)
     assert process.trend.law is not None and "a distance law" in notes[0]
     near, far = np.array([[0.0, 400.0, 1.5], [0.0, 2400.0, 1.5]]) - data.site.origin
     mean, *_ = process.answer(torch.from_numpy(np.stack([near, far])))
@@ -184,7 +184,7 @@ def test_settings_of_many_rows_come_from_near_rows_too():
     decibels = -60 + short + 0.3 * rng.standard_normal(len(places))
     values = {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": decibels}
     data = from_arrays(values, {"name": "pairs"})
-    process, notes = fit_powers(rows_of(data, np.arange(len(data))), data.site)
+    process, notes = fit_powers(power_rows(data, np.arange(len(data))), data.site)
     assert any("given its nearest" in note for note in notes)
     assert process.kernel.lengths[0] < 20
 
@@ -197,7 +197,7 @@ def test_rows_within_centimetres_said_infinite_powers_a_kilometre_away():
     still = np.array([-1.0, -0.7, 0.0])
     data = from_arrays({"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"})
     for mean in ("auto", "distance"):
-        process, _ = fit_powers(rows_of(data, np.arange(8)), data.site, mean=mean)
+        process, _ = fit_powers(power_rows(data, np.arange(8)), data.site, mean=mean)
         far = torch.eye(3, dtype=torch.float64) * 1000.0
         found, *_ = process.answer(far)
         assert (found + 67.5).abs().max() < 150, (mean, found)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.models.reduced import Filled, coarser
+from gsparc.models.reduced import Interpolated, coarsen_grid
 from gsparc.ops import SphereGrid
 
 
 @pytest.mark.parametrize("stride", [2, 3, 5])
 def test_rendered_pixels_stay_where_they_were(stride):
     grid = SphereGrid.hemisphere(90, 360)
-    coarse = coarser(grid, stride)
+    coarse = coarsen_grid(grid, stride)
     assert torch.allclose(coarse.directions(), grid.directions()[::stride, ::stride], atol=1e-12)
 
 
@@ -20,12 +20,12 @@ def test_rendered_pixels_stay_where_they_were(stride):
 def test_linear_images_are_filled_exactly_and_azimuth_wraps(stride, steady):
     grid = SphereGrid.hemisphere(90, 360)
     rows = torch.arange(90.0)[:, None].expand(90, 360)
-    filled = Filled(steady, grid, stride).fill(rows[None, ::stride, ::stride])
+    filled = Interpolated(steady, grid, stride).fill(rows[None, ::stride, ::stride])
     last = (89 // stride) * stride  # rows beyond the last rendered one repeat it
     assert torch.allclose(filled[0], rows.clamp_max(last), atol=1e-4)
     seam = torch.zeros(1, 90, 360)
     seam[..., 0] = 1.0
-    filled = Filled(steady, grid, stride).fill(seam[:, ::stride, ::stride])
+    filled = Interpolated(steady, grid, stride).fill(seam[:, ::stride, ::stride])
     assert torch.allclose(filled[0, :, -1], torch.full((90,), 1 - 1 / stride))
     assert torch.all(filled[..., 0] == 1)
 
@@ -34,12 +34,12 @@ def test_a_grid_that_does_not_close_ends(steady):
     grid = SphereGrid(4, 8, 0.0, 0.0, 0.1, 0.1)
     image = torch.zeros(1, 2, 4)
     image[..., 0] = 1.0
-    assert torch.all(Filled(steady, grid, 2).fill(image)[..., -1] == 0)
+    assert torch.all(Interpolated(steady, grid, 2).fill(image)[..., -1] == 0)
 
 
 def test_columns_that_cannot_be_divided_are_refused():
     with pytest.raises(ValueError, match="stride=7 does not divide the 360 columns"):
-        coarser(SphereGrid.hemisphere(90, 360), 7)
+        coarsen_grid(SphereGrid.hemisphere(90, 360), 7)
 
 
 @pytest.fixture

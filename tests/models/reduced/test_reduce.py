@@ -13,7 +13,7 @@ import torch
 from boxes import room_of_spectra
 from campaigns import brief, channels, compose, spectra
 
-from gsparc.commands.train import Objects, train
+from gsparc.commands.train import TrainedRun, train
 from gsparc.data.load import load
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -39,7 +39,7 @@ class Case(NamedTuple):
 
     @classmethod
     def of(cls, method: Method, data: Measurements, fold: Fold) -> Case:
-        return cls(method, data, fold, method.contributions(data, fold.train))
+        return cls(method, data, fold, method.reduction_inputs(data, fold.train))
 
     @classmethod
     def fit(cls, method: Method, data: Measurements, share: int = 4) -> Case:
@@ -50,11 +50,11 @@ class Case(NamedTuple):
         return cls.of(method, data, fold)
 
     @classmethod
-    def trained(cls, found: Objects) -> Case:
+    def trained(cls, found: TrainedRun) -> Case:
         return cls.of(found.methods[0], found.data, found.split.folds[0])
 
     def less(self, measured: dict[str, Any] | None = None, **settings: Any) -> Any:
-        return reduced.reduced(self.method, settings, measured or self.measured)
+        return reduced.reduce_method(self.method, settings, measured or self.measured)
 
     def answer(self, method: Method | None = None, rows: np.ndarray | None = None) -> Prediction:
         batch = self.data.batch(self.fold.test if rows is None else rows)
@@ -100,7 +100,7 @@ def through_array(tmp_path_factory) -> Case:
 
 def test_fewer_places_say_what_all_of_them_said(through_array):
     case = through_array
-    assert case.method.knobs() == ("keep", "stride", "confidence")
+    assert case.method.reduction_settings() == ("keep", "stride", "confidence")
     ways = [case.less(keep=share) for share in (1.0, 0.75, 0.1)]
     assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
     assert case.method.fitted().emission.encoding.width == 36
@@ -157,15 +157,15 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(process, caplog):
     """The command's own default strides ended it on grids of 7 x 13."""
     columns = process.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(reduced.combinations(process.method, {"stride": [1, 2, 3]})) == [{}, {"stride": 2}]
+    assert list(reduced.setting_combinations(process.method, {"stride": [1, 2, 3]})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.fold, FitContext(Path()))
-    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]})) == [{}]
-    assert reduced.reduced(method, {"keep": 0.5}, {}) is method
+    assert list(reduced.setting_combinations(method, {"keep": [1.0, 0.5]})) == [{}]
+    assert reduced.reduce_method(method, {"keep": 0.5}, {}) is method
 
 
 def test_rendered_channels_spare_directions(tmp_path):

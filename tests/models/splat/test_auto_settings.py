@@ -8,7 +8,7 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import ModelSettings
-from gsparc.models.splat.auto_settings import Choices, resolve, settled
+from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
 
 
 def open_settings(hidden: int = 0, **more) -> ModelSettings:
@@ -32,9 +32,9 @@ def open_settings(hidden: int = 0, **more) -> ModelSettings:
 )
 def test_what_auto_becomes(campaign, kind, static_end, hidden, want):
     site = campaign(kind, static_end=static_end).site
-    choices, notes = resolve(open_settings(hidden), "auto", site)
+    choices, notes = resolve_auto(open_settings(hidden), "auto", site)
     assert choices == want
-    done = settled(open_settings(hidden), choices)
+    done = apply_choices(open_settings(hidden), choices)
     found = (done.emission.encoding.kind, done.emission.activation, done.emission.init_bias)
     assert found == (want.encoding, want.activation, want.init_bias) and done.field.placement != "auto"
     assert [n.split("=")[0] for n in notes][:3] == ["encoding.kind", "init", "activation"]
@@ -49,11 +49,11 @@ def test_what_is_said_stays_and_needs_no_words(campaign):
         field=FieldSettings(placement="uniform"),
         emission=EmissionSettings(EncodingSettings("raw"), activation="sigmoid", init_bias=0.0),
     )
-    choices, notes = resolve(given, "uniform", campaign("spectrum").site)
+    choices, notes = resolve_auto(given, "uniform", campaign("spectrum").site)
     assert choices == Choices("uniform", "raw", "sigmoid", 0.0) and notes == ()
-    assert settled(given, choices) == given
+    assert apply_choices(given, choices) == given
 
 
 def test_the_logarithm_of_distance_brings_its_sigmoid(campaign):
-    choices, _ = resolve(open_settings(4, log_distance=True), "auto", campaign("rssi").site)
+    choices, _ = resolve_auto(open_settings(4, log_distance=True), "auto", campaign("rssi").site)
     assert choices.activation == "sigmoid" and choices.init_bias == 0

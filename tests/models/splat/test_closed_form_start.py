@@ -10,7 +10,7 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
-from gsparc.models.splat.closed_form_start import learn_prior, learn_process, warm_start
+from gsparc.models.splat.closed_form_start import learn_prior, learn_process, solve_emissions
 from gsparc.ops import Pose
 
 KERNEL = EmissionSettings(EncodingSettings("kernel"), activation="linear", init_bias=0.0)
@@ -28,7 +28,7 @@ def starting(data, emission=KERNEL, count: int = 150, on: bool = False) -> tuple
         attenuation=AttenuationSettings(inverse_distance=on),
     )
     model = GaussianModel(settings, data.site, RECEIVER, prior=process.prior)
-    return model, warm_start(model, data, ROWS, RECEIVER, process)
+    return model, solve_emissions(model, data, ROWS, RECEIVER, process)
 
 
 def started(data, *given, **more) -> GaussianModel:

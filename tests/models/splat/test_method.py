@@ -21,7 +21,7 @@ from gsparc.ops import Pose
 
 
 def learned(file, *more: str) -> LearnedField:
-    return build(compose(*brief(file, *more)).model).made_for(load_data({"name": "own", "file": str(file)}))
+    return build(compose(*brief(file, *more)).model).create_for(load_data({"name": "own", "file": str(file)}))
 
 
 def fitted(file, run_dir, *more: str, steps: int = 15, every: int | None = None):

@@ -48,7 +48,7 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
 def test_both_ends_may_move_in_channels():
     data = from_arrays(arrays(World("antennas", 1, 1, "both", "metres", "none", "random", 300), 0))
     split = split_for({"name": "random"}, data)
-    method = Gsparc().made_for(data)
+    method = Gsparc().create_for(data)
     method.fit(data, split.folds[0], FitContext(budget_s=5.0, budget_clock="processor"))
     own, plain = (
         score_methods([method], data, split).figures(),

@@ -58,7 +58,7 @@ class KnownWallsGP(ImageSourceGP):
         self.kernel = KERNEL if self.settings.clutter else KernelVisibility()
 
     @property
-    def stored_as(self) -> type[ImageSourceGP]:
+    def stored_class(self) -> type[ImageSourceGP]:
         """See `Method`; what was found needs no walls to answer."""
         return ImageSourceGP
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import seek_place
-from gsparc.models.target_rows import rows_of
+from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart, matern32
 from gsparc.processes.powers import Rows
@@ -78,7 +78,7 @@ def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[s
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
         own = rows[data.station[rows] == number]
         if len(own):
-            places[number] = seek_place(rows_of(data, own))
+            places[number] = seek_place(power_rows(data, own))
             where = ", ".join(f"{value:.4g}" for value in places[number] + site.origin)
             name = site.stations.name[number]
             notes.append(f"the place of station {name} is not given; estimated from powers at ({where}) m")
@@ -89,7 +89,7 @@ def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkR
     """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
     assert data.station is not None
     station = data.station[rows].astype(np.int64)
-    seen = rows_of(data, rows)
+    seen = power_rows(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
     return LinkRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
 

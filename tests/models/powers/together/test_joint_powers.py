@@ -21,7 +21,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc, choose
-from gsparc.models.per_station import for_stations
+from gsparc.models.per_station import by_station
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together.field import JointPowerField, most_each
 from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
@@ -273,7 +273,7 @@ def test_what_it_refuses():
 def test_gsparc_learns_stations_together(tmp_path):
     data = town()
     fold = fold_of(data)
-    method = for_stations(Gsparc(), data)
+    method = by_station(Gsparc(), data)
     report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
     assert any("6 stations in one model" in note for note in report.notes)
     batch = data.batch(fold.test)
@@ -301,7 +301,7 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
     decibels = -20 - 30 * np.log10(far) + 10 * (data.station == 1)
     data = replace(data, target=(10 ** (decibels / 10)).astype(np.float32)[:, None])
     rows = np.flatnonzero(data.station < 4)
-    method = for_stations(Gsparc(), data)
+    method = by_station(Gsparc(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
     batch = data.batch(np.flatnonzero(data.station < 2))
     assert np.abs(db(method.predict(batch).mean) - db(batch.target)).max() < 2
@@ -312,7 +312,7 @@ def test_halls_gain_over_a_process_of_each_sensor():
     fold = fold_of(data, name="blocks", side_m=3.0)
     errors = []
     for make, stations in ((Gsparc, "together"), (method_class("gp"), "each")):
-        method = for_stations(make(), data)
+        method = by_station(make(), data)
         method.fit(data, fold, FitContext(stations=stations))
         batch = data.batch(fold.test)
         errors.append(np.mean((db(method.predict(batch).mean) - db(batch.target)) ** 2))

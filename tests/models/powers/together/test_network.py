@@ -15,7 +15,7 @@ from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import PerStation, for_stations
+from gsparc.models.per_station import PerStation, by_station
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.network import network_of
@@ -32,7 +32,7 @@ NONE = np.zeros(0, np.int64)
 def fitted(one: Network, count: int, folder: Path, azimuths: bool = True) -> tuple[PerStation, FitReport]:
     """The recommended model of a drive's lists."""
     data = one.data(count, azimuths)
-    method = for_stations(Gsparc(), data)
+    method = by_station(Gsparc(), data)
     assert isinstance(method, PerStation)
     return method, method.fit(data, Fold(np.arange(len(data)), NONE, NONE), FitContext(folder))
 

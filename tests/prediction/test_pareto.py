@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gsparc.evaluation.drawing import style_of
 from gsparc.evaluation.experiment.tradeoff import beaten_by, draw_front
-from gsparc.models.pareto import Point, front, worded
+from gsparc.prediction.pareto import Point, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 

@@ -18,6 +18,8 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import left_out_around
 from gsparc.processes.stored import Stored
 
+LEAST = 1e-9  # of a distance [m] and of a squared error: their logarithms stay finite
+
 
 @dataclass(frozen=True)
 class LeftOut(Stored):
@@ -37,7 +39,7 @@ class LeftOut(Stored):
     gaps: np.ndarray
     predicted: np.ndarray
 
-    def by_process(self) -> np.ndarray:
+    def predict_by_process(self) -> np.ndarray:
         """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
@@ -52,7 +54,7 @@ class LeftOut(Stored):
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]
 
-    def as_far_as(self, distance: float | None) -> int:
+    def nearest_gap(self, distance: float | None) -> int:
         """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.
 
         Args:
@@ -66,7 +68,7 @@ class LeftOut(Stored):
         beyond = [np.where(apart > gap, apart, np.inf).min(1) for gap in self.gaps]
         medians = np.array([np.median(nearest) for nearest in beyond])
         # By ratio: twice as far and half as far are equally wrong.
-        return int(np.argmin(np.abs(np.log(medians + 1e-9) - np.log(distance + 1e-9))))
+        return int(np.argmin(np.abs(np.log(medians + LEAST) - np.log(distance + LEAST))))
 
 
 def predict_left_out(
@@ -103,4 +105,4 @@ def predict_left_out(
 def mean_log_error(error: np.ndarray) -> float:
     """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
     usable = ~np.isnan(error).all(1)
-    return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
+    return float(np.nanmean(np.log(error[usable] + LEAST), axis=1).mean()) if usable.any() else 0.0

@@ -16,11 +16,11 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import of_station
+from gsparc.models.per_station import station_site
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.network import network_of
-from gsparc.models.target_rows import heard
+from gsparc.models.target_rows import decibels, heard_rows
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
@@ -38,16 +38,18 @@ class LearnsTogether(MethodFactory):
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
 
-    def best_stations(
+    def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
-        """See `Method.best_stations`."""
+        """See `Method.choose_stations`."""
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
-        return decide(data, fold, context)
+        return choose_stations(data, fold, context)
 
 
-def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal["each", "together"], str]:
+def choose_stations(
+    data: Measurements, fold: Fold, context: FitContext
+) -> tuple[Literal["each", "together"], str]:
     """Return how stations of a site that can be learned as one are best learned, and why.
 
     Channels share waves and where their stations really stand: together. Powers share little more than a
@@ -60,14 +62,14 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
         return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
     if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
         return "together", "no station of the test rows was heard, and what stations share answers for them"
-    known = heard(data, np.sort(np.concatenate([fold.train, fold.val])))
+    known = heard_rows(data, np.sort(np.concatenate([fold.train, fold.val])))
     if len(known) > ONE_FACTOR:
         return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
     budget = context.time_budget()
     errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
     # Two folds at least are cut, though one may be looked at: a single one would test all rows.
     for inner in cut_inner_folds(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
-        learned = heard(data, np.union1d(inner.train, inner.val))
+        learned = heard_rows(data, np.union1d(inner.train, inner.val))
         # Rows below or above a level have no value to be wrong by.
         queries = inner.test[data.side(inner.test) == 0]
         if len(learned) > most:
@@ -82,7 +84,7 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
         joint.fit(data, Fold(learned, learned[:0], learned[:0]), own)
         rows = np.concatenate([part for part, _ in parts])
         separate = torch.cat([powers for _, powers in parts])
-        target = _decibels(data.batch(rows).target)
+        target = decibels(data.batch(rows).target.flatten().double())
         errors.append([(_levels(joint, data, rows) - target).square(), (separate - target).square()])
         if budget.over():
             break
@@ -103,7 +105,7 @@ def _by_station(
         rows = np.flatnonzero(data.station == number)
         known, left = (np.flatnonzero(np.isin(rows, part)) for part in (learned, queries))
         if len(known) >= LEAST_ROWS:
-            part = data.subset(rows, of_station(data.site, number))
+            part = data.subset(rows, station_site(data.site, number))
             single = PowerField(waves=False, seed=context.seed)
             single.fit(part, Fold(known, known[:0], known[:0]), context)
             yield rows[left], _levels(single, part, left)
@@ -111,8 +113,4 @@ def _by_station(
 
 @torch.no_grad()
 def _levels(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
-    return _decibels(method.predict(data.batch(rows)).mean)
-
-
-def _decibels(power: Tensor) -> Tensor:
-    return 10 * power.flatten().double().clamp_min(1e-30).log10()
+    return decibels(method.predict(data.batch(rows)).mean.flatten().double())

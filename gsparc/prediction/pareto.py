@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
+from gsparc.models.reduced import Settings
 
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 from gsparc.models.baselines.gp import choose_kernel
-from gsparc.models.left_out_images import LeftOut
+from gsparc.models.splat.left_out_images import LeftOut
 
 COUNT, PIXELS = 30, 12
 
@@ -21,7 +21,7 @@ def left() -> LeftOut:
 
 
 def test_the_process_has_not_seen_what_lies_within_the_gap(left):
-    found = left.by_process()
+    found = left.predict_by_process()
     mean, at = left.images.mean(0), torch.from_numpy(left.positions)
     vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
     kernel = choose_kernel(left.positions, vectors * lengths, PIXELS)
@@ -38,8 +38,8 @@ def test_the_process_has_not_seen_what_lies_within_the_gap(left):
 def test_the_gap_is_as_wide_as_held_out_rows_are_far(left):
     apart = cdist(left.positions, left.positions)
     np.fill_diagonal(apart, np.inf)
-    assert left.as_far_as(float(np.median(apart[left.centres].min(1)))) == 0
-    assert left.as_far_as(0.25) == 1 and left.as_far_as(None) == 0
+    assert left.nearest_gap(float(np.median(apart[left.centres].min(1)))) == 0
+    assert left.nearest_gap(0.25) == 1 and left.nearest_gap(None) == 0
 
 
 def test_it_goes_through_a_checkpoint(left):

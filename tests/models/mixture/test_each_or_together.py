@@ -11,8 +11,8 @@ from posts import POSTS, distances, heard
 from scenes import fold_of
 
 from gsparc.data.splits import SplitSettings
-from gsparc.models import each_or_together
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.mixture import each_or_together
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import method_class
@@ -27,7 +27,7 @@ def of_one_law():
 
 
 def test_powers_of_one_law_are_learned_together():
-    how, why = each_or_together.decide(*of_one_law(), FitContext(budget_s=6))
+    how, why = each_or_together.choose_stations(*of_one_law(), FitContext(budget_s=6))
     assert how == "together" and "dB together" in why and "folds)" in why
 
 
@@ -44,21 +44,21 @@ def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best
 
     monkeypatch.setattr(each_or_together, "JointPowerField", wrong("joint_powers"))
     monkeypatch.setattr(each_or_together, "PowerField", wrong("powers"))
-    how, why = each_or_together.decide(*of_one_law(), FitContext(budget_s=60))
+    how, why = each_or_together.choose_stations(*of_one_law(), FitContext(budget_s=60))
     said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
     assert how == best and said in why and "3 folds" in why
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
     monkeypatch.setattr(each_or_together, "ONE_FACTOR", 50)
-    how, why = each_or_together.decide(*of_one_law(), FitContext())
+    how, why = each_or_together.choose_stations(*of_one_law(), FitContext())
     assert how == "each" and why.endswith("rows are more than one factor holds (50)")
 
 
 def test_stations_that_nobody_heard_are_answered_by_what_all_share():
     data, split = of_one_law()[0], SplitSettings("stations", leave_out=1)
     fold = fold_of(data, name="stations", leave_out=1)
-    assert each_or_together.decide(data, fold, FitContext(split=split))[0] == "together"
+    assert each_or_together.choose_stations(data, fold, FitContext(split=split))[0] == "together"
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):
