@@ -27,7 +27,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import Freedom, turning, words
 from gsparc.processes.averages import mean_at_places
-from gsparc.processes.kernel import IsotropicWaves, Kernel
+from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import weights_of
 from gsparc.processes.neighbourhood import covering, spacing
 from gsparc.processes.two_lengths import first_kernel, two_lengths
@@ -207,7 +207,7 @@ class _Rows:
         """Go on from these factors by waves from everywhere alike."""
         # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
-        weights = self._weights(Kernel((waves,), WAVE_NOISE))
+        weights = self._weights(Kernel((waves, WhiteNoise(WAVE_NOISE))))
         factors = self._swept(factors, weights, WAVE_SWEEPS)
         return Alignment(factors, self._error(factors, weights), "carrier")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Generic, Self, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +18,8 @@ class Term(Stored, ABC, Generic[Rows]):
 
     Numbers of a term may be floats, or tensors with gradients where they are being learned.
     """
+
+    by_distance: ClassVar[bool] = False  # whether distances of rows are all that counts, also of both ends
 
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:

@@ -28,7 +28,7 @@ from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import IsotropicWaves, Kernel
+from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
 from gsparc.processes.posterior import Exact, Posterior, approximated
@@ -101,7 +101,8 @@ class ComplexGP(ClosedForm):
         for length in LENGTHS:
             for noise in NOISES:
                 wavenumber = 2 * math.pi / self.site.wavelength
-                yield Kernel((IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber),), noise)
+                waves = IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber)
+                yield Kernel((waves, WhiteNoise(noise)))
 
     def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""

@@ -21,8 +21,10 @@ from gsparc.models.powers.together.learning import Own
 from gsparc.models.powers.together.network import network_of
 from gsparc.models.powers.together.terms import Terms, link_rows
 from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
-from gsparc.processes.sectors import NO_AZIMUTH, SectorKernel, Sectors
+from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -158,13 +160,17 @@ def test_the_pattern_of_a_sector():
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
 
 
+def shadowing() -> Kernel:
+    return Kernel((SectorShadowing((50.0, 50.0), (0.5, 0.2, 0.2, 0.1)), WhiteNoise(0.1)), 20.0)
+
+
 def given_settings() -> JointPowerField:
     """A network's field whose settings nobody learned."""
     one = network(1, moments=60, asked=20)
     data, rows = one.data(6), np.arange(360)
     known = network_of(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
-    own = Own(Prior(SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0), trend), {})
+    own = Own(Prior(shadowing(), trend), {})
     terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
     field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
@@ -195,13 +201,12 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
 
 
 def test_sectors_of_a_site_share_shadowing():
-    kernel = SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0)
+    kernel = shadowing()
     here, there = places(0, 10.0), places(1, 10.0)
     assert float(kernel.between(here, here)) == pytest.approx(1.0)
     assert float(kernel.between(here, there)) == pytest.approx(0.5)
     both = torch.cat([here, there, places(0, 200.0)])
     assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    logs = torch.tensor([50.0, 50, 10, 4, 4, 2, 2]).double().log()
-    for again in (SectorKernel.read(kernel.state()), SectorKernel.of(logs)):
-        assert torch.allclose(again.between(both, both), kernel.between(both, both))
-        assert float(again.noise) == pytest.approx(0.1) and float(again.amplitude) == pytest.approx(20)
+    for again in (restored(stored(kernel)), kernel.at(kernel.parameters())):
+        assert torch.allclose(again.gram(both), kernel.gram(both))
+        assert again.amplitude == 20
