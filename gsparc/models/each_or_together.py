@@ -21,6 +21,7 @@ from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.network import network_of
 from gsparc.models.target_rows import heard
+from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
@@ -32,6 +33,7 @@ class LearnsTogether(MethodFactory):
     both_ends = True
     takes_budget = True
     init: InitSettings
+    own_terms: tuple[Columns, ...] = ()  # of one station's powers
 
     def shares(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
@@ -42,6 +44,8 @@ class LearnsTogether(MethodFactory):
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
         """See `Method.best_stations`."""
+        if self.own_terms:
+            return "each", "model.terms are of one station"
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
         return decide(data, fold, context)

@@ -95,7 +95,7 @@ class PowerField(ClosedForm):
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = rows_of(data, rows), data.site, budget.effort.chosen_on
-        more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
+        more = tuple(InWorld.of(one, site) for one in self.own_terms)
         for one in more:  # once: a query has no time for it, nor has `torch.func`
             one.check(torch.from_numpy(seen.places))
         if self.walls is not None:
