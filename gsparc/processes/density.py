@@ -23,6 +23,7 @@ from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.worker import stop_when_late
 
+LOOKS, SETTLED = 40, 5e-6  # of a walk: most evaluations, and the relative gain of a step that is the last
 BAD = 1e12  # in place of a density where no Cholesky factor exists
 TINY = np.finfo(float).tiny
 
@@ -135,7 +136,7 @@ def gram_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> 
 
 def walked(
     objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
 
@@ -177,7 +178,7 @@ def walked(
 
 def learned(
     objective: Callable[[Kernel], tuple[Tensor, Tensor]], starts: Sequence[Kernel],
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find where an objective of kernels is least, and the kernel there, from the best of `starts` on.
 
@@ -196,7 +197,7 @@ def learned(
 
 def by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
     entries: int = 1, bounded: bool = True,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel."""

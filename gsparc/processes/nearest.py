@@ -24,7 +24,7 @@ from torch import Tensor
 from gsparc.ops.queries import nearest_weights, served
 from gsparc.ops.transforms import numbers
 from gsparc.processes.averages import mean_at_places
-from gsparc.processes.density import learned
+from gsparc.processes.density import TINY, learned
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance, with_nearest
@@ -38,9 +38,7 @@ LOOKED_AT = 1_200  # places whose density given their neighbours chooses the set
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
-LOOKS, SETTLED = 40, 5e-6
 EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
-TINY = 1e-30  # an amplitude has a logarithm
 
 
 def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
@@ -324,7 +322,7 @@ def most_likely_given_nearest(starts: list[Kernel], sample: Sample, distance: np
         distance: between rows of the whole site [m], for bounds of lengths.
     """
     bounds = starts[0].bounds(torch.from_numpy(distance))
-    return learned(lambda one: density_given_nearest(one, sample), starts, bounds, LOOKS, SETTLED)[1]
+    return learned(lambda one: density_given_nearest(one, sample), starts, bounds)[1]
 
 
 def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 Places = TypeVar("Places", np.ndarray, Tensor)
+
+ORIGIN = torch.zeros(3, dtype=torch.float64)
+NO_PLACES = ORIGIN.new_zeros(0, len(ORIGIN))
+UNKNOWN = torch.full_like(ORIGIN, math.nan)  # a place that nobody gave
 
 
 def moving_end(places: Places) -> Places:
@@ -28,9 +34,14 @@ def other_end(places: Places) -> Places:
     return places[..., 3:6]
 
 
-def of_both_ends(places: Places) -> bool:
-    """Tell whether places (n, D) are of both ends."""
-    return places.shape[-1] > 3
+def beyond_ends(places: Places) -> Places:
+    """Return what else than both ends (..., D - 6) tells rows of places (..., D)."""
+    return places[..., 6:]
+
+
+def of_both_ends(places: np.ndarray | Tensor) -> bool:
+    """Tell whether places (..., D) are of both ends."""
+    return places.shape[-1] > len(ORIGIN)
 
 
 def on_floor(points: Places) -> Places:

@@ -13,6 +13,7 @@ from scipy.linalg import eigh
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from gsparc.data.blocks import blocks
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
@@ -22,7 +23,7 @@ from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
 from gsparc.models.reduced import Filled, MeanOnly
 from gsparc.models.target_rows import entry_variance, rows_of, to_real
-from gsparc.processes.density import by_left_out
+from gsparc.processes.density import TINY, by_left_out
 from gsparc.processes.kernel import Kernel, apart
 from gsparc.processes.nearest import Sample, Values, given, most_likely_given_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
@@ -30,9 +31,9 @@ from gsparc.processes.posterior import Exact, Posterior, approximated
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
 from gsparc.processes.prior import Prior
 
-LOOKS = 40  # of a choice of settings
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
 STRONGEST = 32  # components that they are chosen by
+ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,11 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     # n centred rows span n - 1 directions.
     keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
     values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
-    solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
+    solid = values > ROUNDING * max(values[-1], TINY)
     if not solid.any():  # one sample, or all alike
         solid[-1] = True
     values, vectors = values[solid], vectors[:, solid]
-    length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    length = np.sqrt(np.maximum(values, TINY))
     axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
     # A small difference of large sums may round below 0.
@@ -93,14 +94,13 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
-        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
+        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
     starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
     distance = apart(places, places)
-    # The figures move by 1e-4 beyond so many looks.
-    return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
+    return by_left_out(starts, distance, None, values, bounds, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):
@@ -243,16 +243,13 @@ class GaussianProcess(Differentiable, ClosedForm):
 
 
 def projected(
-    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
+    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond them.
-
-    `block` targets are floats at a time.
-    """
+    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
-    for start in range(0, len(targets), block):
-        rows = to_real(targets[start : start + block], kind) - mean
-        scores[start : start + block] = result = rows @ axes.T
+    for part in blocks(targets):
+        rows = to_real(targets[part], kind) - mean
+        scores[part] = result = rows @ axes.T
         beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
@@ -274,6 +271,6 @@ def kernel_given_nearest(
     values = torch.from_numpy(scores[rows][..., strong]).double()
     sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
     result = most_likely_given_nearest([start], sample, pdist(places[row]))
-    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
+    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note

@@ -19,8 +19,11 @@ from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.models.run_factors import aligning, run_quadratic
 from gsparc.ops import Pose
 from gsparc.ops.transforms import numbers
+from gsparc.physics.waves import NEAR_M
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.places import ORIGIN, UNKNOWN
 
 NOBODY = -1  # in place of a station's number: none of them
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
@@ -66,7 +69,7 @@ class Slot:
     @classmethod
     def read(cls, state: dict[str, Any]) -> Slot:
         """Make the slot whose `state` this was."""
-        end = state["end"] if len(state["end"]) else torch.full((3,), math.nan, dtype=torch.float64)
+        end = state["end"] if len(state["end"]) else UNKNOWN
         entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
         return cls(**{**state, **entries, "end": end})
 
@@ -186,19 +189,19 @@ def _order_of(data: Measurements) -> np.ndarray:
 def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
     centre, carrier = static_place(site, station), carrier_of(site, station)
-    zero, every = torch.zeros(3, dtype=torch.float64), tuple(range(antennas))
+    every = tuple(range(antennas))
     if not apart:
-        return [Slot(station, every, tuple(range(tones)), centre, zero, 2 * math.pi * carrier / LIGHT)]
+        return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
     # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
-    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, zero)]
+    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, ORIGIN)]
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
         # Antennas of a moving receiver are offsets in its frame, those of a static one are static ends.
         moves = site.static_end == "tx"
-        both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
+        both = [(centre, one) if moves else (centre + rotation @ one, ORIGIN) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
     for band in bands(frequency, reach):
@@ -210,7 +213,7 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
 def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
     """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
     # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
-    width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
+    width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, NEAR_M))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
 
@@ -220,7 +223,7 @@ def static_place(site: Site, station: int) -> Tensor:
     if site.stations is not None:
         return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
     if site.static_position is None:
-        return torch.full((3,), math.nan, dtype=torch.float64)
+        return UNKNOWN
     return torch.from_numpy(np.asarray(site.static_position, np.float64))
 
 
@@ -239,8 +242,8 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     A static end that is not where any station stands is of station `NOBODY`.
     """
     count = len(tx)
-    receiver = rx.position.reshape(-1, 3).expand(count, 3).cpu().double()
-    turned = rx.rotation.reshape(-1, 3, 3).expand(count, 3, 3).cpu().double()
+    receiver = rx.position.expand(count, -1).cpu().double()
+    turned = rx.rotation.expand(count, -1, -1).cpu().double()
     sender = tx.cpu().double()
     moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
     if site.static_end is None:
@@ -290,7 +293,7 @@ def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
-        nll += outputs * (count * math.log(max(given.scale, 1e-300)) + float(given.factor.log_determinant))
+        nll += outputs * (count * math.log(max(given.scale, TINY)) + float(given.factor.log_determinant))
         # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
@@ -301,7 +304,7 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
         # In units of its own power, as groups have scales of their own.
-        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
+        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)

@@ -12,6 +12,7 @@ from gsparc.models.channels.columns import At, Group, Slot
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.models.channels.terms.spherical import Spherical
+from gsparc.processes.density import TINY
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Common:
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
         spread = (whole - steady) / count
         # Wiener's factor of the mean: its power over that with its error.
-        reliability = steady / (steady + spread).clamp_min(1e-300)
+        reliability = steady / (steady + spread).clamp_min(TINY)
         explained = steady * reliability
         # The direct wave stays: unsure as its gain may be, its shape is right.
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]

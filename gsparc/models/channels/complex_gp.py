@@ -28,26 +28,28 @@ from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import Values, given, solved
 from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
+from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import restored, stored
 from gsparc.processes.two_lengths import first_kernel, two_lengths
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
-NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
-CHOSEN_ON = 1_000  # rows that length and noise are chosen on: each look factors a matrix
-MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
+NOISES = (10.0 ** np.arange(-4, 1)).tolist()  # of the signal's power, candidates
+CHOSEN_ON = Effort.chosen_on  # rows that length and noise are chosen on: each look factors a matrix
 NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
 TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
 ENTRIES = 64  # of their channels
 REFINED = 3  # walks to the two lengths
 NAMED = 6  # factors of runs that a note gives
-ANY = Slot(0, (), (), torch.zeros(3), torch.zeros(3), 0.0)  # kernels know of no end
+ANY = Slot(0, (), (), ORIGIN, ORIGIN, 0.0)  # kernels know of no end
 
 
 class ComplexGP(ClosedForm):
@@ -118,7 +120,7 @@ class ComplexGP(ClosedForm):
         kernels = self._kernels(few.places, few.target)
         kernel = min(kernels, key=lambda one: misfit(*_aligned(one, few, len(names))))
         factors, ((_, told),) = _aligned(kernel, rows, len(names))
-        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), 1e-30)))
+        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
         self.posterior = Exact.of(prior, places, told.values, None, told.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
@@ -143,7 +145,7 @@ class ComplexGP(ClosedForm):
         sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
         kernels = self._kernels(at, values.values)
         kernel = min(kernels, key=lambda one: _density(one, *sample))
-        power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
+        power = max(float(sample[1][:, 0].abs().square().mean()), TINY)
         prior = Prior(replace(kernel, amplitude=power))
         self.posterior = given(prior, values, 0, most=NEAREST)
         self.runs = RunFactors.none()
@@ -218,4 +220,4 @@ def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter
     power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
     spread = float(variance.log().sum()) + again * math.log(kernel.noise)
     count = len(at) + again
-    return math.log(max(power / count, 1e-300)) + spread / count
+    return math.log(max(power / count, TINY)) + spread / count

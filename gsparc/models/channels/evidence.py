@@ -21,6 +21,7 @@ from gsparc.models.channels.terms import Isotropic, Noise
 from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, cached
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.left_out import left_out as left_out_rows
 from gsparc.processes.worker import stop_when_late
 
@@ -96,7 +97,7 @@ def parameters(prior: ChannelPrior) -> Tensor:
 def normalised(group: Group) -> Group:
     """Return the same with targets of unit mean square."""
     # A silent group stays 0 instead of 0 / 0.
-    level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
+    level = group.target.abs().square().mean().clamp_min(TINY).sqrt()
     return replace(group, target=group.target / level)
 
 
@@ -141,7 +142,7 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     count, outputs = part.group.target.shape
     # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
     quadratic = given.scale * part.target.numel() + part.rest / noise
-    scale = max(quadratic / (count * outputs), 1e-300)
+    scale = max(quadratic / (count * outputs), TINY)
     determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
     return Solved(outputs * (count * math.log(scale) + determinant), given, scale)
 

@@ -25,11 +25,12 @@ from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import numbers
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 
-CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
 CHECKED = 64  # rows that this is tried at
 
@@ -148,7 +149,7 @@ class ChannelField(ClosedForm):
         factors, told = aligned(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
-        self.weights = tuple(Weights(group, given, max(given.scale, 1e-300), *rest) for group, given in told)
+        self.weights = tuple(Weights(group, given, max(given.scale, TINY), *rest) for group, given in told)
         self.stations = {}
         for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
@@ -170,13 +171,13 @@ class ChannelField(ClosedForm):
         dtype, device = query.tx.dtype, query.tx.device
         parts = [
             self._answer(moving[part], static[part], turned[part], station[part], dtype)
-            for part in torch.arange(len(moving)).split(max(CHUNK // longest, 1))
+            for part in torch.arange(len(moving)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
             mean.to(device),
             after.to(dtype).to(device),
-            (after / before.clamp_min(1e-300)).clamp(0, 1).to(dtype).to(device),
+            (after / before.clamp_min(TINY)).clamp(0, 1).to(dtype).to(device),
             share.to(device) if self.size() else None,
         )
         return self.runs.restored(told, query.run)

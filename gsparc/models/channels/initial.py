@@ -39,8 +39,9 @@ from gsparc.models.channels.terms.term import Frame
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.left_out import groups_of
+from gsparc.processes.places import ORIGIN, of_both_ends
 from gsparc.processes.worker import Cancelled, cancelled_by
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 BEYOND = 10.0  # extents of the places after which nothing is known any more
 COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
@@ -54,6 +55,7 @@ FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 LEAST = 1e-3  # of all powers: sources below are dropped
+SHARED = 0.3  # of the power, what directions have in common before they are learned
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
 ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
@@ -85,7 +87,7 @@ class ChannelSettings:
     directions: bool = True
     correlated: bool = True
     angles: int = 24
-    rows: int = 400
+    rows: int = Effort.term_rows
     tied: int = 64
     narrow: float = 16.0
     knots: int = 9
@@ -160,7 +162,7 @@ def factors_of_runs(data: Measurements, rows: np.ndarray, budget: TimeBudget) ->
 def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[ChannelPrior, Tensor, str]:
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
     groups = gather(data, rows, False)
-    looked = thinned(groups, 8, budget.effort.chosen_on)
+    looked = thinned(groups, COLUMNS, budget.effort.chosen_on)
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried: list[tuple[float, Tensor, float, float]] = []
@@ -175,7 +177,7 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
-    reach, none = BEYOND * max(extent, wavelength), torch.zeros(3, dtype=torch.float64)
+    reach, none = BEYOND * max(extent, wavelength), ORIGIN
     frame = Frame(everywhere.mean(0), reach, length, GAINS[0] * wavelength, none)
     one = torch.ones(1, dtype=torch.float64)
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
@@ -271,7 +273,7 @@ class _Search:
     @property
     def one_end(self) -> bool:
         """Whether one end stands."""
-        return self.every[0].places.shape[1] == 3
+        return not of_both_ends(self.every[0].places)
 
     def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
@@ -342,10 +344,10 @@ class _Search:
         group, isotropic, old = max(self.groups, key=len), prior[Isotropic], prior.get(Directions)
         angles = directions(group.places, group.slot.wavenumber, count)
         level = isotropic.power if old is None else isotropic.power + old.power.sum()
-        power = (0.7 * level / len(angles)).repeat(len(angles))
+        power = ((1 - SHARED) * level / len(angles)).repeat(len(angles))
         towards = torch.zeros(knots, dtype=torch.float64)
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
-        return prior.changed(replace(isotropic, power=0.3 * level), fresh)
+        return prior.changed(replace(isotropic, power=SHARED * level), fresh)
 
     def _crossed(self, parts: tuple[Compressed, ...], prior: ChannelPrior) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""

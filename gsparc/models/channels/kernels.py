@@ -18,7 +18,11 @@ from gsparc.ops.transforms import beyond_kernels
 from gsparc.physics.waves import NEAR_M
 from gsparc.processes.kernel import IsotropicWaves, matern32_of_squares
 
+SMALL = 1e-12  # z whose sinh(z) / z is 1
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
+
+
+GOLDEN = (1 + math.sqrt(5)) / 2
 
 
 def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
@@ -41,18 +45,18 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
     """
     if squared.requires_grad or along.requires_grad or beyond_kernels(squared, along):
         root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
-        root = torch.where(root.abs() < 1e-9, root + 1e-9, root)
+        root = torch.where(root.abs() < SMALL, root + SMALL, root)
         return root.sinh() / root * (concentration / math.sinh(concentration))
     # In real numbers and in place: complex sqrt and sinh take four times as long.
     with torch.no_grad():
         real, imag = concentration**2 - squared, 2 * concentration * along
         size = (real.square() + imag.square()).sqrt_()
-        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(1e-12)
+        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(SMALL)
         smaller = imag.div_(2 * larger)
         a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
         rising, falling = a.exp(), (-a).exp()
         x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
-        share = size.clamp_min_(1e-24).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
+        share = size.clamp_min_(SMALL**2).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
         return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
@@ -78,7 +82,7 @@ def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tenso
 def sphere(count: int) -> Tensor:
     """Return unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * number / count, math.pi * (1 + 5**0.5) * number
+    height, turn = 1 - 2 * number / count, 2 * math.pi * GOLDEN * number
     radius = (1 - height.square()).sqrt()
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
 
@@ -86,7 +90,8 @@ def sphere(count: int) -> Tensor:
 def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
     """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3) lie in a plane."""
     centred = places - places.mean(0)
-    axes = torch.linalg.svd(centred, full_matrices=False)[2] if len(places) > 2 else torch.eye(3).double()
+    few = torch.eye(places.shape[1], dtype=torch.float64)
+    axes = torch.linalg.svd(centred, full_matrices=False).Vh if len(places) > 2 else few
     height = (centred @ axes[-1]).abs().max()
     if float(height) * wavenumber > FLAT_RAD:
         return sphere(count)

@@ -13,13 +13,14 @@ from gsparc.models.channels.columns import Group
 from gsparc.models.channels.evidence import Compressed, solved
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import ENTRIES
+from gsparc.processes.places import ORIGIN
 
-CHUNK = 300_000  # entries of waves held at a time
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
 REFINED = 3  # halvings of the step
-NONE = 1e-12  # power of a wave that is left out
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def summed_gains(
     """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
-        for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
+        for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
             each = waves(probe, chunk)
             size = known(probe, each)
             total[chunk] += torch.stack([probe.gain(each, level, size) for level in levels], 1)
@@ -98,7 +99,7 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
     direct = prior[Direct]
-    none = prior.changed(replace(direct, power=torch.full_like(direct.power, NONE)))
+    none = prior.changed(replace(direct, power=torch.full_like(direct.power, TINY)))
     probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:
@@ -109,11 +110,11 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
         return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
 
-    best, step = torch.zeros(3, dtype=torch.float64), REACH * wavelength / COARSE
+    best, step = ORIGIN, REACH * wavelength / COARSE
     near = torch.arange(-1, 2, dtype=torch.float64)
     coarse = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64)
     for axis in (coarse, *(near / 2**halving for halving in range(1, REFINED + 1))):
         grid = best + step * torch.cartesian_prod(axis, axis, axis)
         best = grid[gain(grid).argmax()]
-    unmoved, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
+    unmoved, best_gain = gain(torch.stack([ORIGIN, best])).tolist()
     return best if math.isfinite(best_gain) and best_gain > unmoved else None

@@ -33,13 +33,12 @@ from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximated
 from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
 from gsparc.processes.prior import Prior
+from gsparc.processes.shared import QUERIES
 from gsparc.processes.stored import restored, stored
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
-
-QUERIES = 512  # at a time: memory
 
 
 class PowerField(ClosedForm):

@@ -20,9 +20,14 @@ from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
 from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_weights
+from gsparc.physics.decibels import from_decibels, to_decibels
+from gsparc.processes.density import TINY
 from gsparc.processes.nearest import Values, given
+from gsparc.processes.places import of_both_ends
+from gsparc.processes.powers import MOST_ROWS as FACTORED
 from gsparc.processes.powers import Rows, conditioned
 from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.trend import TINY_M
 from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5  # of squares; each solution is blind to one
@@ -30,7 +35,7 @@ SIDES = 8  # squares along the longer side
 BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
-MOST_ROWS = 3_000  # of one least-squares problem per solution
+MOST_ROWS = FACTORED // 2  # of one least-squares problem per solution
 ROWS_PER_WAVE = 6  # two real unknowns each
 BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
 
@@ -53,7 +58,7 @@ class Blend:
         """Return shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
         # Linear between the two distances that were measured, constant beyond either.
-        there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
+        there = ((distance - near) / max(far - near, TINY_M)).clamp(0.0, 1.0)
         inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
         left = self.left[0] + (self.left[1] - self.left[0]) * there
@@ -92,7 +97,7 @@ class Fringes:
         """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
-        return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
+        return self.level + to_decibels(field.real.square() + field.imag.square() + FLOOR)
 
     def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
@@ -130,14 +135,14 @@ def fringes_of(state: dict[str, Any]) -> Fringes:
     """Return the fringes whose `state()` this was."""
     arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
     basis, b = Basis(arrays.pop("waves"), arrays.pop("mixture")), [float(value) for value in state["blend"]]
-    blend = Blend((b[0], b[1]), (b[2], b[3]), (b[4], b[5]))
+    blend = Blend(*zip(b[::2], b[1::2], strict=True))
     level, wavelength = float(state["level"]), float(state["wavelength"])
     return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
 
 
 def sampled(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
-    if wavelength is None or places.shape[1] != 3:
+    if wavelength is None or of_both_ends(places):
         return False
     unique = np.unique(places, axis=0)
     return len(unique) > 1 and float(np.median(nearest(unique))) < wavelength / 2
@@ -172,7 +177,7 @@ def find_fringes(
     fold[order[:probes]] = -1
     chosen = np.sort(order[: probes + count])
     every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
-    level = 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
+    level = float(to_decibels(from_decibels(rows.decibels).mean()))
     basis = basis_of(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
@@ -256,7 +261,7 @@ def _blend(
         # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
-        left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
+        left.append(both / max(float((error[chosen] ** 2).mean()), TINY))
     apart = ~probes
     squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
     gain = compared(squares[apart], error[apart] ** 2, group[apart])
@@ -269,7 +274,7 @@ def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, alike: fl
 
     So many rows as are `alike` count as one.
     """
-    noise = alike * max(float((error**2).mean()), 1e-12)
+    noise = alike * max(float((error**2).mean()), TINY)
     square = max(float(towards @ towards - excess.sum()), 0.0)
     # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
     certain = 1 / SPREAD**2

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsparc.processes.places import moving_end, on_floor
+from gsparc.processes.trend import TINY_M
+
 SIDES = 10  # squares along the longer side of the places' box
 SPREAD = 0.25  # deviation of a prior on what share of a mean a prediction has
 
@@ -35,10 +38,9 @@ def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
     Along the longer side of the places' box there are `sides` squares.
     """
-    ends = places[:, :3] if places.shape[1] == 6 else places
-    low = ends[:, :2].min(0)
-    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / sides * (1 + 1e-9)
-    cell = np.floor((ends[:, :2] - low) / side).astype(np.int64)
+    floor = on_floor(moving_end(places))
+    side = max(float(np.ptp(floor, axis=0).max()), TINY_M) / sides
+    cell = np.floor((floor - floor.min(0)) / side).clip(max=sides - 1).astype(np.int64)
     return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
 
 

@@ -19,9 +19,9 @@ from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import law_of
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
-from gsparc.models.powers.groups import groups
+from gsparc.models.powers.groups import SIDES, groups
 from gsparc.processes.censored import ConditionalGaussian, Sites
-from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
+from gsparc.processes.density import LOOKS, Evidence, by_left_out, gram_of, walked
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
 from gsparc.processes.left_out import groups_of, left_out
 from gsparc.processes.nearest import Values, given, settings_of
@@ -47,8 +47,8 @@ TWO_LENGTHS_NEED = 100  # rows that were heard; for a mixture too: of fewer no s
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
-SIDES = (10, 5)  # squares along the longer side that are left out
-LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
+SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
+REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
@@ -137,8 +137,8 @@ def mixture(
     posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
     # Of all rows: drawn ones are farther apart than those that will answer.
     gram = _relative([_among_rows(rows.loud, one.prior, seed) for one in found])
-    for sides in SIDES:
-        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SIDES)
+    for sides in SPANS:
+        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
@@ -234,7 +234,7 @@ def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
 def _by_left_out(
     starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
 ) -> tuple[float, Kernel]:
-    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
+    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks)
 
 
 def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:

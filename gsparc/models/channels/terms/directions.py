@@ -20,8 +20,8 @@ from gsparc.models.channels.kernels import directed, envelope
 from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
 from gsparc.processes.kernel import apart
+from gsparc.processes.left_out import ENTRIES
 
-BLOCK = 1_000_000  # correlations of directions that are computed at a time
 HALF = 0.25  # length of the mean of directions from which they are of a half sphere
 TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1
 
@@ -78,7 +78,7 @@ class Directions(ChannelTerm):
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
         powers = self.of([one.slot for one in a]).to(torch.complex128)
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
-        for part in a[0].places.split(max(BLOCK // (len(other) * len(self.angles)), 1)):
+        for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
             parts.append(each * envelope(apart(part, other), self.frame.envelope))
         whole = torch.cat(parts, 1)

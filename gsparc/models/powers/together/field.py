@@ -24,24 +24,25 @@ from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
+from gsparc.models.powers.together.learning import TRIED_EACH, Own, learn_own, learn_strength
 from gsparc.models.powers.together.network import by_site, learn_network, network_of
 from gsparc.models.powers.together.terms import Terms, link_rows, places_of
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
+from gsparc.processes.places import moving_end, other_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import REACH
+from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import Shared
+from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
-MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
-PLACES = 600  # that the shared process is known at in the end
+PLACES = 2 * TRIED_EACH  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
@@ -163,14 +164,15 @@ class JointPowerField(ClosedForm):
         """
         posterior, elsewhere = self._conditioned()
         places, number = self._by_process(*self._ends(query))
-        mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
+        mean = torch.zeros(len(places), dtype=torch.float64)
+        spread, share = torch.zeros_like(mean), torch.zeros_like(mean)
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
             if chosen.any():
                 mean[chosen], left = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
-        share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
+        share = (share + self._by_law(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
         return Prediction(power, entry_variance(spread, power, "rssi"), share)
@@ -184,7 +186,7 @@ class JointPowerField(ClosedForm):
             stations: (k,) int64, of each place of a group: several of one place, or one of several.
         """
         posterior, elsewhere = self._conditioned()
-        still = torch.from_numpy(self.places)[stations].expand(*moving.shape[:2], 3)
+        still = torch.from_numpy(self.places)[stations].expand_as(moving)
         places = torch.cat([moving.double(), still], 2).flatten(0, 1)
         places, number = self._by_process(places, stations.repeat(len(moving)))
         places, number = places.unflatten(0, moving.shape[:2]), number[: len(stations)]
@@ -266,7 +268,7 @@ class JointPowerField(ClosedForm):
         """
         _, elsewhere = self._conditioned()
         result, network = copy(self), self.network
-        result.places = np.concatenate([self.places, np.broadcast_to(place, (len(sectors), 3))])
+        result.places = np.concatenate([self.places, np.tile(place, (len(sectors), 1))])
         if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
             raise DataError("azimuths of a new station: this model was learned without azimuths")
         if network is not None:
@@ -283,7 +285,7 @@ class JointPowerField(ClosedForm):
     def _ends(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
         sender = query.tx.cpu().double()
-        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3).cpu().double()
+        receiver = query.rx.position.expand(len(query), -1).cpu().double()
         moving, still = (sender, receiver) if self.site.static_end == "rx" else (receiver, sender)
         table = torch.from_numpy(self.places)
         if query.station is not None:
@@ -294,7 +296,7 @@ class JointPowerField(ClosedForm):
         turned = (number < 0) & (self._standing(moving) >= 0)  # asked the other way round
         here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
         places = torch.where(turned[:, None], there, here)
-        return places, self._standing(places[:, 3:])
+        return places, self._standing(other_end(places))
 
     def _by_process(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
@@ -311,8 +313,8 @@ class JointPowerField(ClosedForm):
         """
         if self._reach is None:
             posterior, _ = self._conditioned()
-            known = torch.cat([one.rows[:, :3] for one in posterior.processes.values()]).numpy()
-            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), 1e-9)
+            known = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
+            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), TINY_M)
         tree, reach = self._reach
         far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)
@@ -330,4 +332,4 @@ class JointPowerField(ClosedForm):
 
 def most_each(stations: int) -> int:
     """Return rows of each station whose factors fit into memory together."""
-    return min(MOST_EACH, int(math.sqrt(MEMORY / 8 / stations)))
+    return min(MOST_ROWS, int(math.sqrt(MEMORY / torch.float64.itemsize / stations)))

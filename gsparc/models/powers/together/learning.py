@@ -20,24 +20,23 @@ from gsparc.models.powers.groups import Gain, compared
 from gsparc.models.powers.together.terms import LinkRows, Terms
 from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
 from gsparc.processes.kernel import Kernel, apart
+from gsparc.processes.places import beyond_ends, moving_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import LEAST_SILENT, conditioned
+from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, conditioned
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import late_when
 from gsparc.training.time_budget import TimeBudget
 
-LOOKS, SETTLED = 40, 1e-6
 START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
-FITTED_ON = 500  # rows of each station, for the law
-LEARNED_ON, LEARNED_EACH = 6_000, 500  # rows of all stations, and of each, for settings that all have alike
+LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
 ENDS_FROM, ENDS_ON = 400, 700  # rows that a station needs for settings of its own, and has them from
 LEAST_STATIONS = 3  # to leave some out
-TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the strength of shared terms
-TRIED_PLACES = 300  # that the shared process is known at
+TRIED_ON = 3_600  # rows of all stations for the strength of shared terms
+TRIED_EACH = 300  # of each, and places that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
@@ -91,7 +90,7 @@ class Own:
             if part.silent.any():
                 wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
                 # Each sector of a site has a level of its own, which its silent rows bound.
-                least = LEAST_SILENT * len(np.unique(part.places[:, 6:], axis=0))
+                least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
                 known = conditioned(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
@@ -126,7 +125,7 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
         for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
             bounds = kernel.bounds(distance)
-            _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
+            _, own = by_left_out([kernel], distance, columns, values, bounds)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return Own(Prior(kernel, trend), priors), notes
@@ -134,7 +133,7 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
 
 def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
     """The law of all stations, of their median level, and what must be said of it."""
-    few = rows.thinned(FITTED_ON, seed)
+    few = rows.thinned(LEARNED_EACH, seed)
     law = fit_law(few, None)
     residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
     residuals = [residual[few.station == number] for number in few.stations]
@@ -148,9 +147,9 @@ def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
 
 def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
-    few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
+    few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
     views = {number: _view(few.of(number), trend) for number in few.stations}
-    at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
+    at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = apart(at, at)
     middle = float(np.median(far.numpy())) or 1.0
     start = Kernel.matern([length * middle for length in START.lengths], START.shares, START.noise)
@@ -162,7 +161,7 @@ def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, 
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = walked(objective, [start.parameters().numpy()], start.bounds(far), LOOKS, SETTLED)
+    best, _ = walked(objective, [start.parameters().numpy()], start.bounds(far))
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
@@ -199,7 +198,7 @@ def learn_strength(
     heard = rows if rows.silent.all() else rows.loud
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
+    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.given(few, bare, seed).processes
@@ -212,7 +211,8 @@ def learn_strength(
             result = _left_out(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
-    gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
+    (_, errors, *_), (_, others, _, station) = best, plain
+    gain = compared(errors**2, others**2, station)
     terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 

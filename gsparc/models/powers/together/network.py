@@ -55,7 +55,7 @@ CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
 SURE = 10.0, 0.1  # nats, and nats a row, by which another azimuth must be likelier
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
 GAINS = torch.arange(-12.0, 12.5, 2.0)  # [dB]
-ROUGH_LOOKS, LOOKS, SETTLED = 150, 40, 1e-5
+ROUGH_LOOKS = 150  # evaluations, each of a sum over rows
 ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose covariance is factored
 LEAST_WHOLE = 30  # places that leave no sector out, for settings by these alone
 STRETCH = 4  # places in the order of the drive that are drawn as one
@@ -190,7 +190,7 @@ def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     free = [(-math.inf, math.inf)]
     # A deviation of 1 dB at least.
     bounds = [*_shared_bounds(), *free * bands, (0.0, math.inf), *free * count]
-    best, _ = walked(objective, [begin], bounds, ROUGH_LOOKS, SETTLED)
+    best, _ = walked(objective, [begin], bounds, ROUGH_LOOKS)
     shared, levels, scale, gains = torch.from_numpy(best).split((len(SHARED), bands, 1, count))
     return replace(start, shared=shared.clone(), levels=levels.clone()), gains, float(scale.exp())
 
@@ -250,7 +250,7 @@ def _by_evidence(
     *bounds, noise = start.terms[0].bounds(middle)
     bounds = [*_shared_bounds(), *[(-math.inf, math.inf)] * bands, *bounds, noise, noise]
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
-    best, _ = walked(objective, [begin], bounds, LOOKS, SETTLED)
+    best, _ = walked(objective, [begin], bounds)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.at(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)

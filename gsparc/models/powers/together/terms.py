@@ -20,12 +20,13 @@ from gsparc.models.baselines.distance_law import seek_place
 from gsparc.models.target_rows import rows_of
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import apart, matern32
+from gsparc.processes.nearest import JITTER
+from gsparc.processes.places import NO_PLACES, moving_end
 from gsparc.processes.powers import Rows
 from gsparc.processes.sectors import Sectors
 from gsparc.processes.trend import Trend
 
-LAW_DB = (5.0, 5.0)  # deviations a decade from the middle, of a slope and of a bend
-JITTER = 1e-6  # of a correlation's diagonal
+LAW_DB = 5.0  # deviation a decade from the middle, of a slope and of a bend
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class LinkRows(Rows):
 
         Rows where something was heard come first where there are too many, up to half of them.
         """
-        _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
+        _, place = np.unique(moving_end(self.places), axis=0, return_inverse=True)
         place = place.reshape(-1)
         # One rank for a place: stations that share places keep the same ones.
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
@@ -117,13 +118,12 @@ class Terms:
     def over(cls, rows: LinkRows, trend: Trend, length: float, places: int, seed: int) -> Terms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
-        none = torch.zeros(0, 3, dtype=torch.float64)
-        bare = cls(trend, float(decades.min()), float(decades.max()), none, length)
+        bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)
         return bare.known_at(rows, places, seed)
 
     def known_at(self, rows: LinkRows, most: int, seed: int) -> Terms:
         """Return the same with g known at so many places of rows, drawn evenly."""
-        every = np.unique(rows.places[:, :3], axis=0)
+        every = np.unique(moving_end(rows.places), axis=0)
         order = np.random.default_rng(seed).permutation(len(every))[:most]
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
@@ -135,10 +135,10 @@ class Terms:
         inside = decades.clamp(self.nearest, self.farthest)
         # Beyond what was heard the parabola goes on as its tangent.
         bend = inside.square() + 2 * inside * (decades - inside)
-        law = torch.stack([decades, bend], 1) * torch.tensor(LAW_DB, dtype=torch.float64)
+        law = LAW_DB * torch.stack([decades, bend], 1)
         if not self.place_db:
             return law
-        near = matern32(apart(self.inducing, places[:, :3]), self.length)
+        near = matern32(apart(self.inducing, moving_end(places)), self.length)
         return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1)
 
     @cached_property
