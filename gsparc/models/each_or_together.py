@@ -19,7 +19,7 @@ from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import of_station
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.network import network_of
+from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.target_rows import heard
 from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext
@@ -60,7 +60,7 @@ def decide(data: Measurements, fold: Fold, context: FitContext) -> tuple[Literal
     assert data.station is not None
     if data.site.kind == "csi":
         return "together", "channels at all stations share waves and the frame of places"
-    if network_of(data) is not None:
+    if find_sectors(data) is not None:
         return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
     if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
         return "together", "no station of the test rows was heard, and what stations share answers for them"

@@ -26,12 +26,12 @@ COMPILED = 2  # terms that compiled kernels sum
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
-def apart(a: Tensor, b: Tensor) -> Tensor:
+def distances(a: Tensor, b: Tensor) -> Tensor:
     """Return distances (..., n, m) [m] of places (..., n, D) and (..., m, D), with gradients; exact at 0.
 
     Differences are formed before squaring: the expanded form loses millimetres in float32.
 
-    >>> apart(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
+    >>> distances(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
     tensor([[5.]])
     """
     if not beyond_kernels(a, b):
@@ -91,7 +91,7 @@ class Stationary(Term[Tensor]):
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """See `Term`."""
-        return self.share * self.correlation(apart(a, b))
+        return self.share * self.correlation(distances(a, b))
 
     def variance(self, a: Tensor) -> Tensor:
         """See `Term`."""
@@ -107,7 +107,7 @@ class Stationary(Term[Tensor]):
 
     def at(self, parameters: Tensor) -> Self:
         """See `Term`."""
-        return replace(self, length=number_of(parameters[0].exp()))
+        return replace(self, length=to_number(parameters[0].exp()))
 
 
 class Shadowing(Stationary):
@@ -173,7 +173,7 @@ class IsotropicWaves(Stationary):
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
         ends = zip(a.split(3, -1), b.split(3, -1), strict=True)
-        first, *other = (self.correlation(apart(*pair)) for pair in ends)
+        first, *other = (self.correlation(distances(*pair)) for pair in ends)
         return first * other[0] if other else first
 
 
@@ -206,7 +206,7 @@ class WhiteNoise(Term[Tensor]):
 
     def at(self, parameters: Tensor) -> Self:
         """See `Term`."""
-        return replace(self, share=number_of(parameters[0].exp()))
+        return replace(self, share=to_number(parameters[0].exp()))
 
 
 @dataclass(frozen=True)
@@ -286,7 +286,7 @@ class Kernel(Stored):
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(apart(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
+        return self.correlation(distances(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
@@ -320,10 +320,10 @@ class Kernel(Stored):
         if count > 1:
             # Of logits all shares lie between 0 and 1, whatever a step does.
             shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
-            signals = tuple(replace(one, share=number_of(s)) for one, s in zip(signals, shares, strict=True))
+            signals = tuple(replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True))
         return replace(self, terms=(*signals, self.terms[-1].at(noise)))
 
 
-def number_of(value: Tensor) -> Tensor | float:
+def to_number(value: Tensor) -> Tensor | float:
     """A tensor () as it is where gradients flow, else its number."""
     return value if value.requires_grad else float(value)

@@ -15,7 +15,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import ExponentialShadowing, apart, number_of
+from gsparc.processes.kernel import ExponentialShadowing, distances, to_number
 from gsparc.processes.places import Places, moving_end, on_floor, other_end
 from gsparc.processes.term import Term
 from gsparc.processes.trend import Trend
@@ -158,7 +158,7 @@ class SectorShadowing(Term[Tensor]):
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return that (..., n, m) of places (..., n, 7) and (..., m, 7), see `Term`."""
-        distance = apart(moving_end(a), moving_end(b))
+        distance = distances(moving_end(a), moving_end(b))
         ways = (on_floor(moving_end(at) - other_end(at)) for at in (a, b))
         towards = [torch.nn.functional.normalize(way, dim=-1) for way in ways]
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
@@ -184,4 +184,4 @@ class SectorShadowing(Term[Tensor]):
     def at(self, parameters: Tensor) -> Self:
         """See `Term`."""
         lengths, shares = parameters.exp().split((len(self.lengths), len(self.shares)))
-        return replace(self, lengths=tuple(map(number_of, lengths)), shares=tuple(map(number_of, shares)))
+        return replace(self, lengths=tuple(map(to_number, lengths)), shares=tuple(map(to_number, shares)))

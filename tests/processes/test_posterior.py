@@ -11,7 +11,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing, WhiteNoise
-from gsparc.processes.nearest import Nearest, Values, given
+from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
@@ -88,7 +88,9 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     one, two = both.answer(queries), pairs.answer(queries)
     torch.testing.assert_close(one.mean, torch.complex(*two.mean.split(2, 1)))
     torch.testing.assert_close(one.left, two.left)
-    near = given(prior, Values(places.numpy(), values, torch.ones(30).double()), 0, most=1000)
+    near = condition_on_nearest(
+        prior, PlaceValues(places.numpy(), values, torch.ones(30).double()), 0, most=1000
+    )
     torch.testing.assert_close(near.answer(queries).mean, one.mean, rtol=1e-5, atol=1e-6)
     again = Nearest.read(near.state()).answer(queries)
     torch.testing.assert_close(again.mean, near.answer(queries).mean)

@@ -25,7 +25,7 @@ from gsparc.data.limits import finite
 from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.powers.together.network import sites_of
+from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -338,7 +338,7 @@ def azimuths_of(site: Site, numbers: np.ndarray) -> np.ndarray:
 def _sites(site: Site, numbers: np.ndarray) -> np.ndarray:
     """Numbers (T,) of the sites that stations belong to."""
     stations = site.stations
-    return np.zeros(1, np.int64) if stations is None else sites_of(stations, stations.position)[numbers]
+    return np.zeros(1, np.int64) if stations is None else number_sites(stations, stations.position)[numbers]
 
 
 def _still(site: Site, names: Sequence[str]) -> np.ndarray:

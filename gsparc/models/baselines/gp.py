@@ -20,15 +20,20 @@ from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.pareto import Settings
-from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
+from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_power_process
 from gsparc.models.reduced import Filled, MeanOnly
 from gsparc.models.target_rows import entry_variance, rows_of, to_real
-from gsparc.processes.density import TINY, by_left_out
-from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.nearest import Sample, Values, given, most_likely_given_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
-from gsparc.processes.posterior import Exact, Posterior, approximated
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
+from gsparc.processes.density import TINY, fit_kernel_by_left_out
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.nearest import (
+    NeighbourSample,
+    PlaceValues,
+    condition_on_nearest,
+    most_likely_given_nearest,
+)
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
+from gsparc.processes.posterior import Exact, Posterior, approximation_label
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, draw_rows
 from gsparc.processes.prior import Prior
 
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
@@ -83,7 +88,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
+def choose_kernel_by_left_out(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
     """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
@@ -99,8 +104,8 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
     starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    distance = apart(places, places)
-    return by_left_out(starts, distance, None, values, bounds, entries=entries, bounded=False)[1]
+    distance = distances(places, places)
+    return fit_kernel_by_left_out(starts, distance, None, values, bounds, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):
@@ -138,8 +143,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         looked_at: np.ndarray | slice = slice(None)
         if len(targets) > CHOSEN_ON:
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
-            looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
-        kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+            looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        kernel = choose_kernel_by_left_out(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
@@ -151,28 +156,30 @@ class GaussianProcess(Differentiable, ClosedForm):
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
-        rows = covering(positions, CHOSEN_ON, 0)
+        rows = covering_rows(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
-        start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
-        scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
-        kernel, fit_note = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
+        start = choose_kernel_by_left_out(positions[rows], parts.scores, len(parts.mean))
+        scores, self.lost = project_targets(targets, self.kind, parts.mean, parts.axes)
+        kernel, fit_note = choose_kernel_by_neighbours(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
-        self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
+        self.scores = condition_on_nearest(
+            Prior(kernel), PlaceValues(positions, torch.from_numpy(scores), once), 0
+        )
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
         scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
-    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
+    def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         assert self.site is not None
-        self.powers, notes = fit_powers(rows, self.site, self.about)
+        self.powers, notes = fit_power_process(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, self.scores if self.powers is None else self.powers.posterior)
+        return approximation_label(self.name, self.scores if self.powers is None else self.powers.posterior)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -183,7 +190,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is None:
             return None
         result = copy.copy(self)
-        result.powers, _ = conditioned(rows_of(data, rows), self.powers.posterior.prior, 0)
+        result.powers, _ = condition_on_powers(rows_of(data, rows), self.powers.posterior.prior, 0)
         return result
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
@@ -242,7 +249,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return Filled(means, grid, stride) if stride > 1 and grid is not None else means
 
 
-def projected(
+def project_targets(
     targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
@@ -254,7 +261,7 @@ def projected(
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
 
-def kernel_given_nearest(
+def choose_kernel_by_neighbours(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
     """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
@@ -265,11 +272,13 @@ def kernel_given_nearest(
         start: a kernel of one length, chosen on few rows.
         seed: of rows that are drawn.
     """
-    row = covering(places, LOOKED_AT, seed)
-    rows = with_nearest(places, row)
+    row = covering_rows(places, LOOKED_AT, seed)
+    rows = rows_with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
-    sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
+    sample = NeighbourSample.of(
+        torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64)
+    )
     result = most_likely_given_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"

@@ -75,7 +75,7 @@ class Slot:
 
 
 @dataclass(frozen=True)
-class At:
+class SlotPlaces:
     """Places of one slot.
 
     Attributes:
@@ -88,7 +88,7 @@ class At:
 
 
 @dataclass(frozen=True)
-class Group(At):
+class Group(SlotPlaces):
     """Training rows of one slot.
 
     Attributes:
@@ -123,7 +123,7 @@ class Group(At):
 
     def state(self, factors: Tensor) -> dict[str, Any]:
         """Return what `read` reads; targets as measured, of runs of these factors."""
-        # Groups hold aligned targets, and `aligned` divides by the factors again when they are read.
+        # Groups hold aligned targets, and `align_runs` divides by the factors again when they are read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 
@@ -138,13 +138,13 @@ class Group(At):
         return numbers((self.places - self.places[0]).mul(1e6).round()).tobytes()
 
 
-def refuse(site: Site) -> None:
+def require_waves(site: Site) -> None:
     """Raise a `ValueError` for data that waves of a known length cannot explain."""
     if site.kind != "csi" or site.wavelength is None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 
 
-def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
+def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
     """Return groups of the given rows (n,).
 
     Args:
@@ -153,7 +153,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
         apart: whether antennas with places of their own and tones far apart are groups of their own; if not,
             all columns of a station are one, measured at the moving end's place at the carrier.
     """
-    refuse(data.site)
+    require_waves(data.site)
     alike, order = np.zeros(len(rows), np.int64), _order_of(data)
     run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
     station = alike if data.station is None or data.site.stations is None else data.station[rows]
@@ -204,13 +204,13 @@ def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> l
         both = [(centre, one) if moves else (centre + rotation @ one, ORIGIN) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
-    for band in bands(frequency, reach):
+    for band in coherent_bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
         slots += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
     return slots
 
 
-def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
+def coherent_bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
     """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
     # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, NEAR_M))
@@ -259,12 +259,12 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
 
 
-def ends_of(groups: tuple[Group, ...]) -> int:
+def count_static_ends(groups: tuple[Group, ...]) -> int:
     """Return how many static ends there are."""
     return len({group.slot.station for group in groups})
 
 
-def aligned(
+def align_runs(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
@@ -288,8 +288,8 @@ def aligned(
     return factors, known
 
 
-def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Return the negative log likelihood [nats] of what `aligned` says, scales profiled out."""
+def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
+    """Return the negative log likelihood [nats] of what `align_runs` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
@@ -311,10 +311,10 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     # `aligning` tells what rows are to be multiplied by, the inverse of what they were.
     estimates[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
     measured = torch.from_numpy(estimates)
-    return measured / measured.abs() if ends_of(groups) > 1 else measured
+    return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
+def thin_groups(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
     """Return at most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.

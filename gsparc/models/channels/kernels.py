@@ -25,17 +25,17 @@ FLAT_RAD = 0.5  # phase over the height of places, below which waves from above 
 GOLDEN = (1 + math.sqrt(5)) / 2
 
 
-def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
+def matern_envelope(distance: Tensor, length: Tensor | float) -> Tensor:
     """Return Matern-3/2 of distances [m]."""
     return matern32_of_squares((distance / length).square())
 
 
-def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
+def squared_exponential(distance: Tensor, length: Tensor | float) -> Tensor:
     """Return the squared exponential of distances [m]."""
     return torch.exp(-0.5 * (distance / length).square())
 
 
-def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
+def directional_correlation(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
     """Return the correlation (...) complex128 of waves that come from about one direction.
 
     Args:
@@ -60,7 +60,7 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
         return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
-def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
+def isotropic_correlation(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
     """Return the correlation (..., n, m) float64 of waves from everywhere alike, in an envelope [m].
 
     Where both ends move, waves leave in all directions as they arrive from all: the product over the ends.
@@ -71,7 +71,7 @@ def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Te
     return IsotropicWaves(length, wavenumber=wavenumber).covariance(a, b)
 
 
-def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
+def spherical_wave(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
     """Return the wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
     away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
     # The amplitude stops growing a quarter of a wavelength away, where no antenna is a point.
@@ -79,7 +79,7 @@ def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tenso
     return torch.polar(level, -wavenumber * away)
 
 
-def sphere(count: int) -> Tensor:
+def fibonacci_sphere(count: int) -> Tensor:
     """Return unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
     height, turn = 1 - 2 * number / count, 2 * math.pi * GOLDEN * number
@@ -87,22 +87,22 @@ def sphere(count: int) -> Tensor:
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
 
 
-def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
+def spread_directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
     """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3) lie in a plane."""
     centred = places - places.mean(0)
     few = torch.eye(places.shape[1], dtype=torch.float64)
     axes = torch.linalg.svd(centred, full_matrices=False).Vh if len(places) > 2 else few
     height = (centred @ axes[-1]).abs().max()
     if float(height) * wavenumber > FLAT_RAD:
-        return sphere(count)
-    half = sphere(2 * count)
+        return fibonacci_sphere(count)
+    half = fibonacci_sphere(2 * count)
     half = half[half[:, 2] > 0]
     # Columns of `basis` are two axes of the plane and its normal.
     basis = torch.stack([axes[0], axes[1], torch.linalg.cross(axes[0], axes[1])], 1)
     return half @ basis.T
 
 
-def cells(places: np.ndarray, depth: int) -> np.ndarray:
+def bisected_cells(places: np.ndarray, depth: int) -> np.ndarray:
     """Return numbers (n,) of 2^depth cells of near places (n, 3), halved across the widest axis."""
     number = np.zeros(len(places), np.int64)
     for _ in range(depth):

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.evidence import Compressed
+from gsparc.models.channels.evidence import GroupInBasis
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.probe import Probe, summed_gains
+from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Images
 from gsparc.models.channels.terms.term import Frame
 from gsparc.processes.density import TINY
@@ -57,7 +57,7 @@ class _Searcher:
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
             return Images.of(self.frame, planes[chunk]).waves(probe.group)
 
-        return summed_gains(probes, len(planes), waves, LEVELS, known)
+        return likelihood_gains(probes, len(planes), waves, LEVELS, known)
 
     def keep(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""
@@ -105,7 +105,7 @@ class _Searcher:
 
 
 def find_mirrors(
-    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], prior: ChannelPrior,
+    coarse: tuple[GroupInBasis, ...], parts: tuple[GroupInBasis, ...], prior: ChannelPrior,
     wavelength: float, most: int,
 ) -> Tensor:  # fmt: skip
     """Return planes (W, 4) float64, local; none where all together are not worth it.
@@ -121,7 +121,7 @@ def find_mirrors(
     search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidates(rough, prior.frame, wavelength)
+    grid, turn = candidate_planes(rough, prior.frame, wavelength)
     while len(search.planes) < most:
         raise_if_cancelled()
         scores = search.gains(search.rough, grid, _about).max(1).values
@@ -136,7 +136,7 @@ def find_mirrors(
     return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
-def candidates(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
+def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
     """Return upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
     points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.evidence import Compressed, solved
+from gsparc.models.channels.evidence import GroupInBasis, solve_group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.processes.density import TINY
@@ -45,9 +45,9 @@ class Probe:
     scale: float
 
     @staticmethod
-    def of(part: Compressed, prior: ChannelPrior) -> Probe:
+    def of(part: GroupInBasis, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
-        at, basis, noise = solved(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
+        at, basis, noise = solve_group(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
@@ -79,7 +79,7 @@ class Probe:
         return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * own[:, None]], 1))
 
 
-def summed_gains(
+def likelihood_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
     known: Callable[[Probe, Tensor], Tensor] = Probe.known,
 ) -> Tensor:  # fmt: skip
@@ -93,7 +93,9 @@ def summed_gains(
     return total
 
 
-def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
+def find_static_offset(
+    parts: tuple[GroupInBasis, ...], prior: ChannelPrior, wavelength: float
+) -> Tensor | None:
     """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
@@ -108,7 +110,7 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
             return torch.cat([at.waves(probe.group) for at in moved])
 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
+        return likely + likelihood_gains(probes, len(offsets), waves, (level,))[:, 0]
 
     best, step = ORIGIN, REACH * wavelength / COARSE
     near = torch.arange(-1, 2, dtype=torch.float64)

@@ -26,7 +26,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import steering
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
 DRAWS_PER_CELL, MIN_DRAWS, MAX_DRAWS = 6, 32, 768  # positions per (quarter wavelength)^3 of the prior
@@ -83,7 +83,7 @@ def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
     """Return (K, m, n), of `phase_vectors` (K, m, 3) and (K, n, 3)."""
-    return apart(first, second).square().mul_(-0.5).exp_()
+    return distances(first, second).square().mul_(-0.5).exp_()
 
 
 @dataclass

@@ -15,7 +15,7 @@ from gsparc.models.image_sources.scene import directions
 from gsparc.models.in_double import in_double
 from gsparc.physics.mirror_planes import orientations
 from gsparc.physics.waves import wave_over_band
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 VARIANCE_ROWS = 350  # that a variance is computed from: fewer overestimate it
@@ -81,7 +81,7 @@ class Means:
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
         """
         dtype = self.towards.dtype
-        squared = apart(queries, self.places).square().to(dtype)
+        squared = distances(queries, self.places).square().to(dtype)
         scaled = torch.addcmul(self.by_angle, squared, self.by_length)
         scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances

@@ -13,7 +13,7 @@ from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene, correlations, steering
 from gsparc.physics.mirror_planes import images
-from gsparc.processes.worker import late
+from gsparc.processes.worker import out_of_time
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -28,7 +28,7 @@ Cost = Callable[[list[Tensor]], Tensor]
 
 
 def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
-    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `late`.
+    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_time`.
 
     Args:
         rows: measurements.
@@ -54,7 +54,7 @@ def refine(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Sc
             value, gradient = value + more.item(), [g + s for g, s in zip(gradient, slopes, strict=True)]
         if value < lowest:
             lowest, best = value, values
-        if step == steps or late():
+        if step == steps or out_of_time():
             break
         decay = 1.0 if step < DECAY_AFTER * steps else DECAY
         moved = []
@@ -97,7 +97,7 @@ def _likelihood(
 
 
 def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibility) -> Scene:
-    """Fit the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
+    """Fit the visibility kernel by likelihood until `out_of_time`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.
@@ -120,7 +120,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, centre: KernelVisibil
         return replace(trial, quadrature=float(torch.sigmoid(value.detach()[3])))
 
     for _ in range(steps):
-        if late():
+        if out_of_time():
             break
         posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()

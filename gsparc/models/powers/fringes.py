@@ -18,14 +18,20 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
-from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_weights
+from gsparc.models.powers.groups import SPREAD, ErrorGain, compare_errors, number_squares, split_groups
+from gsparc.models.powers.waves import (
+    FLOOR,
+    PlaneWaveBasis,
+    field_decibels,
+    fit_wave_weights,
+    plane_wave_basis,
+)
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
-from gsparc.processes.nearest import Values, given
+from gsparc.processes.nearest import PlaceValues, condition_on_nearest
 from gsparc.processes.places import of_both_ends
 from gsparc.processes.powers import MOST_ROWS as FACTORED
-from gsparc.processes.powers import Rows, conditioned
+from gsparc.processes.powers import PowerRows, condition_on_powers
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.trend import TINY_M
 from gsparc.training.time_budget import TimeBudget
@@ -80,7 +86,7 @@ class Fringes:
         blend: with the process.
     """
 
-    basis: Basis
+    basis: PlaneWaveBasis
     weights: np.ndarray
     blind: np.ndarray
     rows: np.ndarray
@@ -123,7 +129,7 @@ class Fringes:
         return decibels + share * (mean - decibels), factor
 
     def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `fringes_of` needs."""
+        """Return tensors and numbers that `read_fringes` needs."""
         arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
         arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
         blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
@@ -131,30 +137,33 @@ class Fringes:
         return {**{name: torch.from_numpy(value) for name, value in arrays.items()}, **numbers}
 
 
-def fringes_of(state: dict[str, Any]) -> Fringes:
+def read_fringes(state: dict[str, Any]) -> Fringes:
     """Return the fringes whose `state()` this was."""
     arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
-    basis, b = Basis(arrays.pop("waves"), arrays.pop("mixture")), [float(value) for value in state["blend"]]
+    basis, b = (
+        PlaneWaveBasis(arrays.pop("waves"), arrays.pop("mixture")),
+        [float(value) for value in state["blend"]],
+    )
     blend = Blend(*zip(b[::2], b[1::2], strict=True))
     level, wavelength = float(state["level"]), float(state["wavelength"])
     return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
 
 
-def sampled(places: np.ndarray, wavelength: float | None) -> bool:
+def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
     if wavelength is None or of_both_ends(places):
         return False
     unique = np.unique(places, axis=0)
-    return len(unique) > 1 and float(np.median(nearest(unique))) < wavelength / 2
+    return len(unique) > 1 and float(np.median(nearest_distances(unique))) < wavelength / 2
 
 
-def nearest(places: np.ndarray) -> np.ndarray:
+def nearest_distances(places: np.ndarray) -> np.ndarray:
     """Return distances (n,) of places (n, 3) from the nearest other [m]."""
     return cKDTree(places).query(places, k=2)[0][:, 1]
 
 
-def find_fringes(
-    rows: Rows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
+def fit_fringes(
+    rows: PowerRows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
 ) -> tuple[Fringes | None, str]:
     """Return fringes where they pay beside a process, and what must be said of them.
 
@@ -170,28 +179,31 @@ def find_fringes(
     order, probes = rng.permutation(total), total // PROBES
     count = min(total - probes, MOST_ROWS)
     tail = f" (of {count} of {total} rows)" if count < total - probes else ""
-    squares, fold = groups(rows.places, SIDES), np.full(total, -1)
-    parts = folds(squares, FOLDS, seed)
+    squares, fold = number_squares(rows.places, SIDES), np.full(total, -1)
+    parts = split_groups(squares, FOLDS, seed)
     for k, part in enumerate(parts):
         fold[part] = k
     fold[order[:probes]] = -1
     chosen = np.sort(order[: probes + count])
     every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
     level = float(to_decibels(from_decibels(rows.decibels).mean()))
-    basis = basis_of(rows.places[fold >= 0], wavelength)
+    basis = plane_wave_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
     error, distance = (one[chosen] for one in _apart(every, [*parts, order[:probes]], plain, seed))
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
-    gain: Gain | None = None
+    gain: ErrorGain | None = None
     while len(weights) < budget.effort.fringes and not budget.over():
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
-            weights.append(fit_weights(columns[seen], rows.decibels[seen] - level, rng))
-        powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
+            weights.append(fit_wave_weights(columns[seen], rows.decibels[seen] - level, rng))
+        powers, blind = (
+            level + field_decibels(columns @ np.stack(weights, 1)),
+            np.arange(len(weights)) % FOLDS,
+        )
         blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
@@ -223,20 +235,26 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     return spread * (1 / number - 1 / every)
 
 
-def _apart(rows: Rows, parts: list[np.ndarray], prior: Prior, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _apart(
+    rows: PowerRows, parts: list[np.ndarray], prior: Prior, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n,) of a process at rows of each part without that part, and distances (n,) to the rest [m].
 
     Of all rows, as it will answer: at some of them alone it would seem worse than it is.
     """
     error, distance = np.zeros((2, len(rows.places)))
     values = torch.from_numpy(rows.decibels)[:, None]
-    dense = given(prior, Values.of(rows.places, values), seed) if len(rows.places) > MOST_ROWS else None
+    dense = (
+        condition_on_nearest(prior, PlaceValues.of(rows.places, values), seed)
+        if len(rows.places) > MOST_ROWS
+        else None
+    )
     at = None if dense is None else dense.near.every.query(rows.places)[1]
     for part in parts:
         known: Posterior
         if dense is None or at is None:
             rest = np.setdiff1d(np.arange(len(rows.places)), part)
-            known = conditioned(rows.at(rest), prior, seed)[0].posterior
+            known = condition_on_powers(rows.at(rest), prior, seed)[0].posterior
         else:
             known = dense.at(np.setdiff1d(at, at[part]), seed)
         places = torch.from_numpy(rows.places[part])
@@ -246,9 +264,9 @@ def _apart(rows: Rows, parts: list[np.ndarray], prior: Prior, seed: int) -> tupl
 
 
 def _blend(
-    rows: Rows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
+    rows: PowerRows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
     error: np.ndarray, distance: np.ndarray,
-) -> tuple[Blend, Gain]:  # fmt: skip
+) -> tuple[Blend, ErrorGain]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
     # From the process's prediction, measured plus error, to that of the solutions.
@@ -264,7 +282,7 @@ def _blend(
         left.append(both / max(float((error[chosen] ** 2).mean()), TINY))
     apart = ~probes
     squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
-    gain = compared(squares[apart], error[apart] ** 2, group[apart])
+    gain = compare_errors(squares[apart], error[apart] ** 2, group[apart])
     middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 

@@ -15,7 +15,7 @@ SPREAD = 0.25  # deviation of a prior on what share of a mean a prediction has
 
 
 @dataclass(frozen=True)
-class Gain:
+class ErrorGain:
     """What one prior gains over another at rows left out.
 
     Attributes:
@@ -33,7 +33,7 @@ class Gain:
         return self.squares > errors * self.error
 
 
-def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
+def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
     """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
 
     Along the longer side of the places' box there are `sides` squares.
@@ -44,15 +44,15 @@ def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
     return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
+def split_groups(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     """Return `count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
     names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
     parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
     return [part for part in parts if len(part)]
 
 
-def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
+def compare_errors(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> ErrorGain:
     """Return what `one` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
     gain = other - one
     total = np.bincount(group, gain - gain.mean())
-    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))
+    return ErrorGain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))

@@ -26,7 +26,7 @@ def as_terms(terms: Any) -> tuple[Columns, ...]:
 
 
 @dataclass(frozen=True)
-class InWorld(Columns):
+class UserTerm(Columns):
     """A term that is asked of both ends in the coordinates of the measurements.
 
     Attributes:
@@ -40,7 +40,7 @@ class InWorld(Columns):
     still: Tensor
 
     @classmethod
-    def of(cls, term: Columns, site: Site) -> InWorld:
+    def of(cls, term: Columns, site: Site) -> UserTerm:
         """Return a term of a site of one station, or of ends that both move."""
         still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
         return cls(term, *(torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)))
@@ -60,7 +60,7 @@ class InWorld(Columns):
             raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed{why}")
 
 
-def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:
+def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[str]:
     """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
     at = posterior.rows
     columns = posterior.prior.columns(at)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.linalg import blas, eigh
 
-from gsparc.models.channels.kernels import sphere
+from gsparc.models.channels.kernels import fibonacci_sphere
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
 
@@ -32,7 +32,7 @@ TRIES, SETTLED = 4, 1e-4
 
 
 @dataclass(frozen=True)
-class Basis:
+class PlaneWaveBasis:
     """Coherent fields of unit mean power at the places that they were made for.
 
     Attributes:
@@ -52,25 +52,25 @@ class Basis:
         return self.plane(places) @ self.mixture
 
 
-def basis_of(places: np.ndarray, wavelength: float) -> Basis:
+def plane_wave_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
     """Return combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
 
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
     """
-    waves = 2 * math.pi / wavelength * sphere(WAVES).numpy()
-    plane = Basis(waves, np.eye(WAVES)).plane(places)
+    waves = 2 * math.pi / wavelength * fibonacci_sphere(WAVES).numpy()
+    plane = PlaneWaveBasis(waves, np.eye(WAVES)).plane(places)
     # One triangle of a Hermitian product: half the multiplications of all of it.
     values, vectors = eigh(blas.zherk(1 / len(places), plane, trans=2), lower=False)
     large = values > KEPT * values[-1]
-    return Basis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
+    return PlaneWaveBasis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
 
 
-def decibels_of(field: np.ndarray) -> np.ndarray:
+def field_decibels(field: np.ndarray) -> np.ndarray:
     """Return powers [dB] of complex fields of any shape, with the floor."""
     return to_decibels(np.abs(field) ** 2 + FLOOR)
 
 
-def fit_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def fit_wave_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
 
     A weight's prior is complex normal of variance 1.

@@ -22,9 +22,9 @@ from gsparc.models.baselines.distance_law import (
     Rows,
     fit_law,
     law_variance,
-    log_below,
-    misfit,
-    seek_place,
+    likelihood_slopes,
+    locate_still_end,
+    log_probability_below,
 )
 from gsparc.training.context import FitContext
 
@@ -82,7 +82,7 @@ def test_all_rows_at_one_place():
 
 def test_the_density_has_mass_one_and_its_variance():
     def density(z: float) -> float:
-        return float(np.exp(-misfit(np.array([z]), np.array([False]), 1.0)[0]))
+        return float(np.exp(-likelihood_slopes(np.array([z]), np.array([False]), 1.0)[0]))
 
     ends = [-40, -3, 3, 40]
     for power, expected in ((0, 1.0), (2, VARIANCE)):
@@ -90,24 +90,24 @@ def test_the_density_has_mass_one_and_its_variance():
         assert sum(parts) == pytest.approx(expected, rel=1e-6)
     for z in (-7.0, -3.0, -1.0, 0.5, 3.0, 5.0):
         below = sum(quad(density, a, min(b, z))[0] for a, b in pairwise(ends) if a < z)
-        assert log_below(np.array([z]))[0] == pytest.approx(np.log(below), abs=1e-6)
-    assert MASS > 0 and np.isfinite(log_below(np.array([-1e9, 1e9]))).all()
+        assert log_probability_below(np.array([z]))[0] == pytest.approx(np.log(below), abs=1e-6)
+    assert MASS > 0 and np.isfinite(log_probability_below(np.array([-1e9, 1e9]))).all()
 
 
 def test_slopes_of_the_misfit():
     rng = np.random.default_rng(1)
     residual, side = 6 * rng.standard_normal(40), rng.integers(-1, 2, 40)
-    _, slope, by_scale = misfit(residual, side, 2.0)
+    _, slope, by_scale = likelihood_slopes(residual, side, 2.0)
     step = 1e-5 * rng.standard_normal(40)
-    ends = [misfit(residual + sign * step, side, 2.0)[0] for sign in (-0.5, 0.5)]
+    ends = [likelihood_slopes(residual + sign * step, side, 2.0)[0] for sign in (-0.5, 0.5)]
     assert slope @ step == pytest.approx(ends[1] - ends[0], rel=1e-4)
-    ends = [misfit(residual, side, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
+    ends = [likelihood_slopes(residual, side, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
     assert by_scale == pytest.approx((ends[1] - ends[0]) / 1e-5, rel=1e-4)
 
 
 def test_a_place_nobody_gave_is_estimated_and_said():
     rows = rows_of(noise=1.0)
-    place = seek_place(rows)
+    place = locate_still_end(rows)
     assert np.linalg.norm(place[:2] - STILL[:2]) < 3.0
     data = data_of(rows)
     unknown = replace(data, site=replace(data.site, static_position=None))

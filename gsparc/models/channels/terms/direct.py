@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
-from gsparc.models.channels.kernels import steering
+from gsparc.models.channels.columns import Slot, SlotPlaces
+from gsparc.models.channels.kernels import spherical_wave
 from gsparc.models.channels.terms.spherical import Spherical
 from gsparc.processes.places import moving_end, of_both_ends, other_end
 
@@ -24,14 +24,14 @@ class Direct(Spherical):
         """Return the end (1, 3) [m], see `Spherical`."""
         return (slot.end + self.frame.offset)[None]
 
-    def waves(self, at: At) -> Tensor:
+    def waves(self, at: SlotPlaces) -> Tensor:
         """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
         if not of_both_ends(at.places):
             return super().waves(at)
         middle, wavenumber = moving_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)
         between = moving_end(at.places) - other_end(at.places)
-        return steering(between, torch.zeros_like(middle), wavenumber, away)[None]
+        return spherical_wave(between, torch.zeros_like(middle), wavenumber, away)[None]
 
     @property
     def worth(self) -> int:

@@ -22,7 +22,7 @@ from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_am
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class KnownWallsGP(ImageSourceGP):
             near = walls_cost(given.planes, given.sequences, values[1], values[2])
             return near + prior.cost(values[4], given.sequences)
 
-        with late_when(budget.over):
+        with ending_when(budget.over):
             scene = with_phases(rows, given, QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, STEPS[0], self.kernel)
             prior = ReflectionPhasePrior.of(scene)

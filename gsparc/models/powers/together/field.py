@@ -24,9 +24,14 @@ from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.together.learning import TRIED_EACH, Own, learn_own, learn_strength
-from gsparc.models.powers.together.network import by_site, learn_network, network_of
-from gsparc.models.powers.together.terms import Terms, link_rows, places_of
+from gsparc.models.powers.together.learning import (
+    TRIED_EACH,
+    StationPriors,
+    learn_shared_terms,
+    learn_station_priors,
+)
+from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
+from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations, station_places
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
@@ -35,7 +40,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
-from gsparc.processes.shared import Shared
+from gsparc.processes.shared import SharedTermsPosterior
 from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -57,21 +62,21 @@ class JointPowerField(ClosedForm):
     name = "process of many stations' powers"
     site: Site
     places: np.ndarray  # (T, 3) float64 of the stations [m]
-    own: Own  # of the stations' own processes
-    heard: Terms  # shared terms for stations that have rows
-    unheard: Terms  # those for all others
+    own: StationPriors  # of the stations' own processes
+    heard: SharedTerms  # shared terms for stations that have rows
+    unheard: SharedTerms  # those for all others
 
     def __init__(self, shared: bool = True, seed: int = 0) -> None:
         self.shared, self.seed = shared, seed
         self.inflation = 1.0  # of variances of stations never heard
-        self.posterior: Shared | None = None
-        self.elsewhere: Shared | None = None
+        self.posterior: SharedTermsPosterior | None = None
+        self.elsewhere: SharedTermsPosterior | None = None
         self.whole = 1.0  # variance of what was measured, of all stations [dB^2]
         self.rows: dict[int, Tensor] = {}  # of what was heard of each station
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
 
     @classmethod
-    def of(cls, site: Site, places: np.ndarray, own: Own, terms: Terms) -> JointPowerField:
+    def of(cls, site: Site, places: np.ndarray, own: StationPriors, terms: SharedTerms) -> JointPowerField:
         """Return one of known settings whose stations share `terms`, to be conditioned."""
         result = cls()
         result.site, result.places, result.own = site, places, own
@@ -97,23 +102,23 @@ class JointPowerField(ClosedForm):
     def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
         assert data.site.stations is not None
-        self.places, notes = places_of(data, rows)
-        every = link_rows(data, rows, self.places)
-        network = network_of(data, self.places)
+        self.places, notes = station_places(data, rows)
+        every = rows_of_stations(data, rows, self.places)
+        network = find_sectors(data, self.places)
         if network is None:
-            self.own, remarks = learn_own(every, self.seed, budget)
+            self.own, remarks = learn_station_priors(every, self.seed, budget)
         else:
-            every = by_site(every, network)
+            every = relabel_by_site(every, network)
             prior, remarks = learn_network(every, network, data.site.stations.name, self.seed, budget)
-            self.own = Own(prior, {})
-        most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
+            self.own = StationPriors(prior, {})
+        most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
         assert self.own.never.trend is not None
-        self.heard = self.unheard = Terms.over(every, self.own.never.trend, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.over(every, self.own.never.trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
-        terms, self.inflation, gain = learn_strength(every, self.own, self.seed, budget)
+        terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)
         if gain is None:
             remarks.append("no shared terms: too few stations to leave some out")
             return (*notes, *remarks)
@@ -142,9 +147,9 @@ class JointPowerField(ClosedForm):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; silent rows say that powers are below a level."""
-        every = link_rows(data, rows, self.places)
-        every = every if self.network is None else by_site(every, self.network)
-        used = every.thinned(most_each(len(every.stations)), self.seed)
+        every = rows_of_stations(data, rows, self.places)
+        every = every if self.network is None else relabel_by_site(every, self.network)
+        used = every.thinned(rows_per_station(len(every.stations)), self.seed)
         self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
@@ -239,21 +244,23 @@ class JointPowerField(ClosedForm):
         self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
         never = Prior.read(state["never"])
         assert never.trend is not None
-        self.own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
-        self.heard, self.unheard = (Terms(never.trend, **state[name]) for name in ("heard", "unheard"))
+        self.own = StationPriors(
+            never, {int(number): Prior.read(part) for number, part in state["own"].items()}
+        )
+        self.heard, self.unheard = (SharedTerms(never.trend, **state[name]) for name in ("heard", "unheard"))
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
         if "processes" in state:
             processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
             weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
-            self.posterior = Shared(processes, never, self.heard.columns, weights[0])
+            self.posterior = SharedTermsPosterior(processes, never, self.heard.columns, weights[0])
             self.elsewhere = self._elsewhere(weights[1])
 
-    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> Shared:
+    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
         """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
         never, network = self.own.never, self.network
         never = never if network is None else replace(never, trend=network.joined_by(ROUND))
-        return Shared({}, never, self.unheard.columns, weights)
+        return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
     def with_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
         """Return one that knows k further stations, of no rows, as its last.
@@ -277,7 +284,7 @@ class JointPowerField(ClosedForm):
         result.elsewhere = result._elsewhere((elsewhere.factor, elsewhere.mean))
         return result
 
-    def _conditioned(self) -> tuple[Shared, Shared]:
+    def _conditioned(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
         if self.posterior is None or self.elsewhere is None:
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
@@ -330,6 +337,6 @@ class JointPowerField(ClosedForm):
         return from_real(decibels[:, None], "rssi", (1,))
 
 
-def most_each(stations: int) -> int:
+def rows_per_station(stations: int) -> int:
     """Return rows of each station whose factors fit into memory together."""
     return min(MOST_ROWS, int(math.sqrt(MEMORY / torch.float64.itemsize / stations)))

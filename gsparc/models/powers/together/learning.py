@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.groups import Gain, compared
-from gsparc.models.powers.together.terms import LinkRows, Terms
-from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart
+from gsparc.models.powers.groups import ErrorGain, compare_errors
+from gsparc.models.powers.together.terms import SharedTerms, StationRows
+from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.places import beyond_ends, moving_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, conditioned
+from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
-from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
+from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
@@ -48,7 +48,7 @@ PLAIN = Trend(0.0)
 
 
 @dataclass(frozen=True)
-class WithTerms(Trend):
+class TrendWithShared(Trend):
     """A trend with what all stations share among its uncertain terms, in units of `unit` [dB]."""
 
     inner: Trend = PLAIN
@@ -65,7 +65,7 @@ class WithTerms(Trend):
 
 
 @dataclass(frozen=True)
-class Own:
+class StationPriors:
     """Priors of stations' own processes.
 
     Attributes:
@@ -80,7 +80,7 @@ class Own:
         """Return that of a station."""
         return self.heard.get(number, self.never)
 
-    def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
+    def given(self, rows: StationRows, terms: SharedTerms, seed: int) -> SharedTermsPosterior:
         """Return what rows say; pseudo-values of silent ones follow from their own station's."""
         result = {}
         for number in rows.stations:
@@ -88,15 +88,17 @@ class Own:
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
-                wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
+                wide = TrendWithShared(
+                    0.0, inner=_trend(prior), shared=terms.columns, unit=process_deviation(prior)
+                )
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
-                known = conditioned(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
+                known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
             result[number] = Exact.of(prior, places, values, extra)
-        return Shared(result, self.never, terms.columns)
+        return SharedTermsPosterior(result, self.never, terms.columns)
 
     @property
     def variance(self) -> float:
@@ -109,7 +111,9 @@ def _trend(prior: Prior) -> Trend:
     return prior.trend
 
 
-def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
+def learn_station_priors(
+    rows: StationRows, seed: int, budget: TimeBudget | None = None
+) -> tuple[StationPriors, list[str]]:
     """Return the law and settings of own processes, and what must be said of them.
 
     Searches end with what they have when the budget is over; single stations then have no settings of
@@ -118,20 +122,20 @@ def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tu
     trend, notes = _site_law(rows, seed)
     heard = rows if rows.silent.all() else rows.loud
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
-    with nullcontext() if budget is None else late_when(budget.over):
+    with nullcontext() if budget is None else ending_when(budget.over):
         kernel, priors = _common_settings(heard, trend, seed)
         if budget is not None and budget.over():
             numbers = []
         for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
             bounds = kernel.bounds(distance)
-            _, own = by_left_out([kernel], distance, columns, values, bounds)
+            _, own = fit_kernel_by_left_out([kernel], distance, columns, values, bounds)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
-    return Own(Prior(kernel, trend), priors), notes
+    return StationPriors(Prior(kernel, trend), priors), notes
 
 
-def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
+def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     """The law of all stations, of their median level, and what must be said of it."""
     few = rows.thinned(LEARNED_EACH, seed)
     law = fit_law(few, None)
@@ -145,23 +149,23 @@ def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
 
 
-def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
+def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
     views = {number: _view(few.of(number), trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
-    far = apart(at, at)
+    far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
     start = Kernel.matern([length * middle for length in START.lengths], START.shares, START.noise)
 
     def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
-        return LeftOutDensity.apply(gram_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
+        return LeftOutDensity.apply(covariance_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
 
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = walked(objective, [start.parameters().numpy()], start.bounds(far))
+    best, _ = minimise(objective, [start.parameters().numpy()], start.bounds(far))
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
@@ -173,16 +177,16 @@ def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, 
     }
 
 
-def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+def _view(rows: StationRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (n, n) [m], uncertain terms (n, Q) and values less the mean (n, 1) [dB]."""
     places = torch.from_numpy(rows.places)
     values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.columns(places), values[:, None]
+    return distances(places, places), trend.columns(places), values[:, None]
 
 
-def learn_strength(
-    rows: LinkRows, own: Own, seed: int, budget: TimeBudget | None = None
-) -> tuple[Terms, float, Gain | None]:
+def learn_shared_terms(
+    rows: StationRows, own: StationPriors, seed: int, budget: TimeBudget | None = None
+) -> tuple[SharedTerms, float, ErrorGain | None]:
     """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
@@ -198,7 +202,7 @@ def learn_strength(
     heard = rows if rows.silent.all() else rows.loud
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.given(few, bare, seed).processes
@@ -212,19 +216,19 @@ def learn_strength(
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
     (_, errors, *_), (_, others, _, station) = best, plain
-    gain = compared(errors**2, others**2, station)
+    gain = compare_errors(errors**2, others**2, station)
     terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
-def _left_out(processes: Mapping[int, Exact], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
+def _left_out(processes: Mapping[int, Exact], terms: SharedTerms) -> tuple[np.ndarray, float, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
     errors, ratios = [], []
     blocks = [Block.of(process, terms.columns(process.rows)) for process in processes.values()]
-    for error, variance in left_out_whole(blocks):
+    for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())
     station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])

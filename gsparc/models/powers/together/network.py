@@ -21,11 +21,11 @@ from torch import Tensor
 from gsparc.data.errors import Caution
 from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.together.terms import LinkRows
-from gsparc.processes.censored import Sites
-from gsparc.processes.density import Evidence, walked
+from gsparc.models.powers.together.terms import StationRows
+from gsparc.processes.censored import PseudoValues
+from gsparc.processes.density import Evidence, minimise
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel, WhiteNoise, apart
+from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import moving_end, on_floor, other_end
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import (
@@ -39,7 +39,7 @@ from gsparc.processes.sectors import (
     sector_of,
 )
 from gsparc.processes.trend import LEAST_SPREAD
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
@@ -61,7 +61,7 @@ LEAST_WHOLE = 30  # places that leave no sector out, for settings by these alone
 STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
-def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
+def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
     """Return the sectors that stations are; None without known beams or lists of sites with several.
 
     Args:
@@ -72,7 +72,7 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
     assert stations is not None
     places = stations.position if places is None else places
     sector = np.full((len(places), len(USUAL) + 1), np.nan) if stations.sector is None else stations.sector
-    site = sites_of(stations, places)
+    site = number_sites(stations, places)
     levels = () if data.censored is None else np.unique(data.target[data.censored > 0])
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
     if not several and not np.isfinite(sector[:, 0]).any():
@@ -91,11 +91,11 @@ def network_of(data: Measurements, places: np.ndarray | None = None) -> Sectors 
     return Sectors(0.0, table=torch.from_numpy(table), site=which[0], band=which[1])
 
 
-def sites_of(stations: Stations, places: np.ndarray) -> np.ndarray:
+def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:
     """Return numbers (T,) int64 of the sites that stations at places (T, 3) [m] belong to.
 
     >>> at = np.array([[0.0, 0, 0], [20, 0, 0], [500, 0, 0]])
-    >>> sites_of(Stations(at, ("A-1", "A-2", "B-1")), at)
+    >>> number_sites(Stations(at, ("A-1", "A-2", "B-1")), at)
     array([0, 0, 1])
     """
     apart = np.linalg.norm(on_floor(places[:, None] - places), axis=-1)
@@ -107,7 +107,7 @@ def sites_of(stations: Stations, places: np.ndarray) -> np.ndarray:
     return connected_components(near)[1].astype(np.int64)
 
 
-def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
+def relabel_by_site(rows: StationRows, network: Sectors) -> StationRows:
     """Return the same by sites; places (n, 7) say which station a row is of."""
     ends = moving_end(rows.places), other_end(rows.places)
     places = np.concatenate([*ends, rows.station[:, None]], 1)
@@ -115,12 +115,12 @@ def by_site(rows: LinkRows, network: Sectors) -> LinkRows:
 
 
 def learn_network(
-    rows: LinkRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
+    rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
 ) -> tuple[Prior, list[str]]:
     """Return the prior of every site of a network, and what must be said of it.
 
     Args:
-        rows: by sites, see `by_site`.
+        rows: by sites, see `relabel_by_site`.
         network: of the stations.
         names: (T,) of the stations.
         seed: of rows drawn.
@@ -134,7 +134,7 @@ def learn_network(
         network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
     )  # fmt: skip
-    with nullcontext() if budget is None else late_when(budget.over):
+    with nullcontext() if budget is None else ending_when(budget.over):
         rough, gains, scale = _rough(few, start)
         turned, notes = _turned(few, rough, gains, scale, names)
         if notes:
@@ -158,7 +158,7 @@ def learn_network(
     return Prior(kernel, trend), [law_note, *aimed, *notes]
 
 
-def _misfit(mean: Tensor, rows: LinkRows, scale: Tensor) -> Tensor:
+def _misfit(mean: Tensor, rows: StationRows, scale: Tensor) -> Tensor:
     """Negative log likelihood of each row (..., n), independent of the others."""
     z = (torch.from_numpy(rows.decibels) - mean) / scale
     side = torch.from_numpy(rows.side)
@@ -176,7 +176,7 @@ def _shared_bounds() -> list[tuple[float, float]]:
     return list(zip(*(end.tolist() for end in ends), strict=True))
 
 
-def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
+def _rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
     places, number = torch.from_numpy(rows.places), torch.from_numpy(sector_of(rows.places).astype(np.int64))
     bands, count = len(start.levels), len(start.table)
@@ -190,14 +190,14 @@ def _rough(rows: LinkRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     free = [(-math.inf, math.inf)]
     # A deviation of 1 dB at least.
     bounds = [*_shared_bounds(), *free * bands, (0.0, math.inf), *free * count]
-    best, _ = walked(objective, [begin], bounds, ROUGH_LOOKS)
+    best, _ = minimise(objective, [begin], bounds, ROUGH_LOOKS)
     shared, levels, scale, gains = torch.from_numpy(best).split((len(SHARED), bands, 1, count))
     return replace(start, shared=shared.clone(), levels=levels.clone()), gains, float(scale.exp())
 
 
 @torch.no_grad()
 def _turned(
-    rows: LinkRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
+    rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> tuple[Sectors, list[str]]:
     """Azimuths that rows contradict turned to where they fit, and a note of each."""
     table, notes = trend.table.clone(), list[str]()
@@ -224,7 +224,7 @@ def _turned(
 
 
 def _by_evidence(
-    rows: LinkRows, rough: Sectors, gains: Tensor, scale: float, seed: int
+    rows: StationRows, rough: Sectors, gains: Tensor, scale: float, seed: int
 ) -> tuple[Sectors, Kernel]:
     """All settings of largest evidence of some rows of each site."""
     rows, bands = _whole(rows), len(rough.levels)
@@ -234,8 +234,8 @@ def _by_evidence(
     side = [torch.from_numpy(part.side) for part in parts]
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + bands, 0, dtype=torch.float64))
     own = [gram @ gram.T for gram in map(rough.columns, places)]
-    count, last = sum(map(len, places)), [list[Sites]() for _ in parts]
-    middle = float(apart(*(moving_end(places[0]),) * 2).median()) or 1.0
+    count, last = sum(map(len, places)), [list[PseudoValues]() for _ in parts]
+    middle = float(distances(*(moving_end(places[0]),) * 2).median()) or 1.0
     start = _usual_kernel(rough, middle, max(scale**2, 1.0), max(float(gains.var()), 1.0))
     usual = start.parameters()
 
@@ -250,7 +250,7 @@ def _by_evidence(
     *bounds, noise = start.terms[0].bounds(middle)
     bounds = [*_shared_bounds(), *[(-math.inf, math.inf)] * bands, *bounds, noise, noise]
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
-    best, _ = walked(objective, [begin], bounds)
+    best, _ = minimise(objective, [begin], bounds)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.at(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
@@ -280,7 +280,7 @@ def _relative(kernel: Kernel) -> Kernel:
     return Kernel((replace(signal, shares=shares), WhiteNoise(kernel.noise / amplitude)), amplitude)
 
 
-def _whole(rows: LinkRows) -> LinkRows:
+def _whole(rows: StationRows) -> StationRows:
     """Those of places that have as many rows as any, if these are enough; else all."""
     place = np.unique(moving_end(rows.places), axis=0, return_inverse=True)[1].reshape(-1)
     sectors = np.unique(np.stack([place, sector_of(rows.places).astype(np.int64)], 1), axis=0)[:, 0]
@@ -289,7 +289,7 @@ def _whole(rows: LinkRows) -> LinkRows:
     return rows.at(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
 
 
-def _stretches(rows: LinkRows, most: int, seed: int) -> LinkRows:
+def _stretches(rows: StationRows, most: int, seed: int) -> StationRows:
     """At most so many rows, all that there are of places that follow each other in short stretches.
 
     To take some of the rows of a place would tell of stronger or weaker ones than there are.

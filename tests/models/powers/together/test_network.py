@@ -17,9 +17,9 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, for_stations
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.learning import Own
-from gsparc.models.powers.together.network import network_of
-from gsparc.models.powers.together.terms import Terms, link_rows
+from gsparc.models.powers.together.learning import StationPriors
+from gsparc.models.powers.together.network import find_sectors
+from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
@@ -117,10 +117,10 @@ def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
 def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
-    assert network_of(data, one.place).site.max() == 9
-    assert network_of(data, one.place + 500 * np.arange(30)[:, None]) is None
+    assert find_sectors(data, one.place).site.max() == 9
+    assert find_sectors(data, one.place + 500 * np.arange(30)[:, None]) is None
     whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
-    assert network_of(whole) is None  # of all stations, not of the strongest
+    assert find_sectors(whole) is None  # of all stations, not of the strongest
 
 
 def test_sectors_belong_to_a_site_by_name_or_by_a_column():
@@ -129,11 +129,11 @@ def test_sectors_belong_to_a_site_by_name_or_by_a_column():
     apart = replace(one, place=one.place + np.tile([[0.0, 0, 0], [20, 0, 0], [0, 20, 0]], (10, 1)))
     arrays = apart.arrays(6)
     said = from_arrays(arrays, {"name": "network"})
-    assert network_of(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
+    assert find_sectors(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
     names = {"station_name": np.array([f"cell{i}" for i in range(30)])}
-    assert network_of(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
+    assert find_sectors(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
     column = {"station_site": np.repeat(np.arange(10.0), 3)}
-    assert network_of(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
+    assert find_sectors(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
 
 
 def sectors() -> Sectors:
@@ -168,10 +168,10 @@ def given_settings() -> JointPowerField:
     """A network's field whose settings nobody learned."""
     one = network(1, moments=60, asked=20)
     data, rows = one.data(6), np.arange(360)
-    known = network_of(data)
+    known = find_sectors(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
-    own = Own(Prior(shadowing(), trend), {})
-    terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    own = StationPriors(Prior(shadowing(), trend), {})
+    terms = SharedTerms.over(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
     field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
     return field
