@@ -23,7 +23,7 @@ from gsparc.models.pareto import Settings
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_power_process
 from gsparc.models.reduced import Filled, MeanOnly
 from gsparc.models.target_rows import entry_variance, rows_of, to_real
-from gsparc.processes.density import TINY, fit_kernel_by_left_out
+from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.nearest import (
     NeighbourSample,
@@ -105,7 +105,9 @@ def choose_kernel_by_left_out(positions: np.ndarray, scores: np.ndarray, entries
     starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
     distance = distances(places, places)
-    return fit_kernel_by_left_out(starts, distance, None, values, bounds, entries=entries, bounded=False)[1]
+    # The figures move by 1e-4 beyond this.
+    known = starts, distance, None, values, bounds
+    return fit_kernel_by_left_out(*known, tolerance=2 * SETTLED, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):
@@ -162,9 +164,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         scores, self.lost = project_targets(targets, self.kind, parts.mean, parts.axes)
         kernel, fit_note = choose_kernel_by_neighbours(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
-        self.scores = condition_on_nearest(
-            Prior(kernel), PlaceValues(positions, torch.from_numpy(scores), once), 0
-        )
+        values = PlaceValues(positions, torch.from_numpy(scores), once)
+        self.scores = condition_on_nearest(Prior(kernel), values, 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
         scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
@@ -276,9 +277,8 @@ def choose_kernel_by_neighbours(
     rows = rows_with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
-    sample = NeighbourSample.of(
-        torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64)
-    )
+    once = torch.ones(rows.shape, dtype=torch.float64)
+    sample = NeighbourSample.of(torch.from_numpy(places[rows]), values, once)
     result = most_likely_given_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"

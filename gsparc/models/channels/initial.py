@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -55,9 +56,7 @@ COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on
 ENDS = 64  # of several static ends, those that powers are learned on in the end
 CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
 SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
-ALIGNED = (
-    1_500  # rows that tell factors of runs: of 2,400 they turn them by two degrees, in a third of the time
-)
+ALIGNED = 1_500  # rows that tell factors of runs: two degrees from those of 2,400, in a third of the time
 FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
@@ -158,15 +157,11 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudge
     # Directions turn factors by a degree and double the seconds.
     few = ChannelSettings(directions=False, correlated=False, mirrors=0)
     prior, _ = find_terms(data, rows, few, budget)
-    runs, groups = (
-        np.unique(np.asarray(data.run)[rows]),
-        thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED),
-    )
-    covariances = [
-        signal + prior.disturbance(group)
-        for signal, group in zip(prior.of_groups(groups), groups, strict=True)
-    ]
-    return RunFactors(runs, align_runs(groups, covariances, len(runs))[0])
+    groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
+    both = zip(prior.of_groups(groups), groups, strict=True)
+    runs = np.unique(np.asarray(data.run)[rows])
+    factors, _ = align_runs(groups, [signal + prior.disturbance(group) for signal, group in both], len(runs))
+    return RunFactors(runs, factors)
 
 
 def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[ChannelPrior, Tensor, str]:
@@ -177,9 +172,8 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried: list[tuple[float, Tensor, float, float]] = []
     for length in LENGTHS:
-        bounded = [
-            isotropic_correlation(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked
-        ]
+        isotropic = partial(isotropic_correlation, length=length * wavelength)
+        bounded = [isotropic(g.places, g.places, g.slot.wavenumber) for g in looked]
         for noise in NOISES:
             if tried and budget.over():
                 break

@@ -24,13 +24,7 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import counted
 from gsparc.models.method import Prediction
-from gsparc.models.powers.fringes import (
-    Fringes,
-    fit_fringes,
-    nearest_distances,
-    read_fringes,
-    resolves_wavelength,
-)
+from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
 from gsparc.models.powers.own_terms import UserTerm, describe_weights
 from gsparc.models.powers.settings import LAW_NEEDS, candidate_priors, choose_candidate, mix_candidates
 from gsparc.models.target_rows import entry_variance, from_real, rows_of
@@ -163,10 +157,8 @@ class PowerField(ClosedForm):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
         seen = rows_of(data, rows)
-        own, *others = (
-            (share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors
-        )
-        self.powers = replace(own[1], others=tuple(others))
+        each = [(share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors]
+        self.powers = replace(each[0][1], others=tuple(each[1:]))
         # The tree is of the rows before.
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
@@ -221,15 +213,15 @@ class PowerField(ClosedForm):
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
-            **({} if self.fringes is None else {"fringes": self.fringes.state()}),
+            "fringes": stored(self.fringes),
             "process": stored(self.powers),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.seed = site, int(state["seed"])
-        self.priors, self.powers = restored(state["priors"]), restored(state["process"])
-        self.fringes = read_fringes(state["fringes"]) if "fringes" in state else None
+        parts = (restored(state[name]) for name in ("priors", "process", "fringes"))
+        self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 
     def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,6 +32,7 @@ from gsparc.processes.places import of_both_ends
 from gsparc.processes.powers import MOST_ROWS as FACTORED
 from gsparc.processes.powers import PowerRows, condition_on_powers
 from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.stored import Stored
 from gsparc.processes.trend import TINY_M
 from gsparc.training.time_budget import TimeBudget
 
@@ -47,7 +47,7 @@ BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose th
 
 
 @dataclass(frozen=True)
-class Blend:
+class Blend(Stored):
     """How solutions and process share a prediction, by the distance to the nearest row.
 
     Attributes:
@@ -72,7 +72,7 @@ class Blend:
 
 
 @dataclass(frozen=True)
-class Fringes:
+class Fringes(Stored):
     """Solutions, and what they are worth beside a process.
 
     Attributes:
@@ -128,26 +128,6 @@ class Fringes:
         share, factor = self.blend.at(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `read_fringes` needs."""
-        arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
-        arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
-        blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
-        numbers = {"level": self.level, "wavelength": self.wavelength, "blend": blend}
-        return {**{name: torch.from_numpy(value) for name, value in arrays.items()}, **numbers}
-
-
-def read_fringes(state: dict[str, Any]) -> Fringes:
-    """Return the fringes whose `state()` this was."""
-    arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
-    basis, b = (
-        PlaneWaveBasis(arrays.pop("waves"), arrays.pop("mixture")),
-        [float(value) for value in state["blend"]],
-    )
-    blend = Blend(*zip(b[::2], b[1::2], strict=True))
-    level, wavelength = float(state["level"]), float(state["wavelength"])
-    return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
-
 
 def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
@@ -200,10 +180,8 @@ def fit_fringes(
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_wave_weights(columns[seen], rows.decibels[seen] - level, rng))
-        powers, blind = (
-            level + field_decibels(columns @ np.stack(weights, 1)),
-            np.arange(len(weights)) % FOLDS,
-        )
+        blind = np.arange(len(weights)) % FOLDS
+        powers = level + field_decibels(columns @ np.stack(weights, 1))
         blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
@@ -243,20 +221,15 @@ def _apart(
     Of all rows, as it will answer: at some of them alone it would seem worse than it is.
     """
     error, distance = np.zeros((2, len(rows.places)))
-    values = torch.from_numpy(rows.decibels)[:, None]
-    dense = (
-        condition_on_nearest(prior, PlaceValues.of(rows.places, values), seed)
-        if len(rows.places) > MOST_ROWS
-        else None
-    )
-    at = None if dense is None else dense.near.every.query(rows.places)[1]
+    if many := len(rows.places) > MOST_ROWS:
+        values = PlaceValues.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
+        dense = condition_on_nearest(prior, values, seed)
+        at = dense.near.every.query(rows.places)[1]
     for part in parts:
-        known: Posterior
-        if dense is None or at is None:
-            rest = np.setdiff1d(np.arange(len(rows.places)), part)
-            known = condition_on_powers(rows.at(rest), prior, seed)[0].posterior
-        else:
-            known = dense.at(np.setdiff1d(at, at[part]), seed)
+        rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)
+        known: Posterior = (
+            dense.at(rest, seed) if many else condition_on_powers(rows.at(rest), prior, seed)[0].posterior
+        )
         places = torch.from_numpy(rows.places[part])
         error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
         distance[part] = known.distance(places).numpy()

@@ -17,6 +17,7 @@ from scipy.linalg import blas, eigh
 from gsparc.models.channels.kernels import fibonacci_sphere
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.stored import Stored
 
 WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
 KEPT = 1e-3  # eigenvalues kept, of the largest
@@ -32,7 +33,7 @@ TRIES, SETTLED = 4, 1e-4
 
 
 @dataclass(frozen=True)
-class PlaneWaveBasis:
+class PlaneWaveBasis(Stored):
     """Coherent fields of unit mean power at the places that they were made for.
 
     Attributes:

@@ -243,11 +243,9 @@ class JointPowerField(ClosedForm):
         """See `Method.restore`."""
         self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
         never = Prior.read(state["never"])
-        assert never.trend is not None
-        self.own = StationPriors(
-            never, {int(number): Prior.read(part) for number, part in state["own"].items()}
-        )
-        self.heard, self.unheard = (SharedTerms(never.trend, **state[name]) for name in ("heard", "unheard"))
+        heard = {int(number): Prior.read(part) for number, part in state["own"].items()}
+        self.own = StationPriors(never, heard)
+        self.heard, self.unheard = (SharedTerms.read(state[name]) for name in ("heard", "unheard"))
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
         if "processes" in state:

@@ -7,7 +7,7 @@ rows hardly tells how strong they are. Each station by turns is predicted from t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
@@ -30,6 +30,7 @@ from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+SETTLED = 1e-6  # of settings that all stations have alike
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
 LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
@@ -42,26 +43,6 @@ PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
 TOLD = 20.0  # amplitudes of a pseudo-value's variance, beyond which it is left out: .5 % of rmse at most
 WIDEST = 4.0  # factor that variances are corrected by at most
-
-
-PLAIN = Trend(0.0)
-
-
-@dataclass(frozen=True)
-class TrendWithShared(Trend):
-    """A trend with what all stations share among its uncertain terms, in units of `unit` [dB]."""
-
-    inner: Trend = PLAIN
-    shared: Callable[[Tensor], Tensor] = torch.zeros_like
-    unit: float = 1.0
-
-    def mean(self, places: Tensor) -> Tensor:
-        """See `Trend`."""
-        return self.inner.mean(places)
-
-    def columns(self, places: Tensor) -> Tensor:
-        """See `Trend`."""
-        return torch.cat([self.inner.columns(places), self.shared(places) / self.unit], 1)
 
 
 @dataclass(frozen=True)
@@ -88,12 +69,12 @@ class StationPriors:
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
-                wide = TrendWithShared(
-                    0.0, inner=_trend(prior), shared=terms.columns, unit=process_deviation(prior)
-                )
+                trend = _trend(prior)
+                shared = replace(terms, unit=process_deviation(prior))
+                wide = replace(trend, more=(*trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
-                known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
+                known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
@@ -129,7 +110,7 @@ def learn_station_priors(
         for number in numbers:
             distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
             bounds = kernel.bounds(distance)
-            _, own = fit_kernel_by_left_out([kernel], distance, columns, values, bounds)
+            _, own = fit_kernel_by_left_out([kernel], distance, columns, values, bounds, tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -165,7 +146,7 @@ def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kerne
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = minimise(objective, [start.parameters().numpy()], start.bounds(far))
+    best, _ = minimise(objective, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from gsparc.processes.nearest import JITTER
 from gsparc.processes.places import NO_PLACES, moving_end
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.sectors import Sectors
+from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 
 LAW_DB = 5.0  # deviation a decade from the middle, of a slope and of a bend
@@ -96,7 +96,7 @@ def rows_of_stations(data: Measurements, rows: np.ndarray, places: np.ndarray) -
 
 
 @dataclass(frozen=True)
-class SharedTerms:
+class SharedTerms(Columns):
     """Shared terms; tensors are float64.
 
     Attributes:
@@ -105,6 +105,7 @@ class SharedTerms:
         inducing: (M, 3) places that g is known at [m].
         length: of g [m].
         place_db: deviation of g; 0: there is none.
+        unit: of columns [dB].
     """
 
     trend: Trend
@@ -113,6 +114,7 @@ class SharedTerms:
     inducing: Tensor
     length: float
     place_db: float = 0.0
+    unit: float = 1.0
 
     @classmethod
     def over(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
@@ -128,7 +130,7 @@ class SharedTerms:
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
-        """Return (n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
+        """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
         if isinstance(self.trend, Sectors):
             return places.new_zeros(len(places), 0)  # each site has its own
         decades = _decades(self.trend, places)
@@ -137,9 +139,9 @@ class SharedTerms:
         bend = inside.square() + 2 * inside * (decades - inside)
         law = LAW_DB * torch.stack([decades, bend], 1)
         if not self.place_db:
-            return law
+            return law / self.unit
         near = matern32(distances(self.inducing, moving_end(places)), self.length)
-        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1)
+        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1) / self.unit
 
     @cached_property
     def _factor(self) -> Factor:
@@ -147,10 +149,6 @@ class SharedTerms:
         # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
         return Factor.of(gram, "raise")
-
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that it is made of, but for the trend."""
-        return {name: value for name, value in vars(self).items() if name not in ("trend", "_factor")}
 
 
 def _decades(trend: Trend, places: Tensor) -> Tensor:

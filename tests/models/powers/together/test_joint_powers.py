@@ -256,7 +256,7 @@ def test_rows_are_thinned_at_places_that_stations_share():
     few = rows_of(town()).thinned(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
     assert len(np.unique(few.places[:, :3], axis=0)) == 20
-    assert rows_per_station(1) == together.MOST_EACH and 3_500 < rows_per_station(12) < together.MOST_EACH
+    assert rows_per_station(1) == together.MOST_ROWS and 3_500 < rows_per_station(12) < together.MOST_ROWS
 
 
 def test_what_it_refuses():
