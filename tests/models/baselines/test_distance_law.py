@@ -19,27 +19,27 @@ from gsparc.models.baselines.distance_law import (
     VARIANCE,
     DistanceLaw,
     Law,
-    Rows,
     fit_law,
     law_variance,
     likelihood_slopes,
     locate_still_end,
     log_probability_below,
 )
+from gsparc.processes.powers import PowerRows
 from gsparc.training.context import FitContext
 
 STILL = np.array([3.0, -8.0, 6.0])
 
 
-def rows_of(count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0) -> Rows:
+def rows_of(count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0) -> PowerRows:
     rng = np.random.default_rng(0)
     places = np.c_[rng.uniform(-40, 40, (count, 2)), np.full(count, 1.5)]
     far = np.maximum(np.linalg.norm(places - STILL, axis=1), floor)
     decibels = -40 - 10 * exponent * np.log10(far) + noise * rng.standard_normal(count)
-    return Rows(places, decibels, np.zeros(count, bool))
+    return PowerRows(places, decibels, np.zeros(count, bool))
 
 
-def data_of(rows: Rows, **more: np.ndarray) -> Measurements:
+def data_of(rows: PowerRows, **more: np.ndarray) -> Measurements:
     arrays = {"rx_position": rows.places, "tx_position": STILL, "rssi_db": rows.decibels}
     return from_arrays({**arrays, **more}, {"name": "law"})
 
@@ -123,7 +123,7 @@ def test_both_ends_move():
     rng = np.random.default_rng(0)
     ends = rng.uniform(-30, 30, (200, 6))
     far = np.linalg.norm(ends[:, :3] - ends[:, 3:], axis=1)
-    law = fit_law(Rows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None)
+    law = fit_law(PowerRows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None)
     assert law.place is None and law.exponent == pytest.approx(2.2, abs=0.15)
     mean = law.mean(torch.from_numpy(ends)).numpy()
     assert np.allclose(mean, law.mean(torch.from_numpy(ends[:, [3, 4, 5, 0, 1, 2]])).numpy())
