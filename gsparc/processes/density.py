@@ -197,7 +197,7 @@ def fit_kernel(
 
 def fit_kernel_by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
-    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
+    bounds: Sequence[tuple[float, float]] = (), looks: int = LOOKS, tolerance: float = SETTLED,
     entries: int = 1, bounded: bool = True,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel."""
@@ -207,5 +207,6 @@ def fit_kernel_by_left_out(
         value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
         return value / len(values), amplitude
 
+    bounds = bounds or starts[0].bounds(distance)
     value, kernel = fit_kernel(objective, starts, bounds, looks, tolerance)
     return value * len(values), kernel

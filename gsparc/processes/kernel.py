@@ -93,10 +93,6 @@ class Stationary(Term[Tensor]):
         """See `Term`."""
         return self.share * self.correlation(distances(a, b))
 
-    def variance(self, a: Tensor) -> Tensor:
-        """See `Term`."""
-        return self.share * a.new_ones(len(a))
-
     def parameters(self) -> Tensor:
         """Return the logarithm of the length (1,); shares are learned by the sum."""
         return torch.tensor([self.length], dtype=torch.float64).log()
@@ -191,10 +187,6 @@ class WhiteNoise(Term[Tensor]):
         """See `Term`; 0 between rows that are not the same ones."""
         alike = a.new_zeros(len(a), len(b))
         return self.share * (alike.fill_diagonal_(1.0) if a is b else alike)
-
-    def variance(self, a: Tensor) -> Tensor:
-        """See `Term`."""
-        return self.share * a.new_ones(len(a))
 
     def parameters(self) -> Tensor:
         """Return the logarithm of the share (1,)."""

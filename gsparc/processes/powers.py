@@ -14,7 +14,7 @@ from torch import Tensor
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, expectation_propagation
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel
+from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
 from gsparc.processes.posterior import Exact, Posterior
@@ -60,6 +60,21 @@ class PowerRows:
         """Those that were measured."""
         return self.at(np.flatnonzero(~self.silent))
 
+    @property
+    def heard(self) -> Self:
+        """Those that were measured, or all where none was."""
+        return self if self.silent.all() else self.loud
+
+    def at_places(self) -> PlaceValues:
+        """Return means (m, 1) [dB] over the rows of each place."""
+        return PlaceValues.of(self.places, torch.from_numpy(self.decibels)[:, None])
+
+    def beside(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
+        places = torch.from_numpy(self.places)
+        rest = torch.from_numpy(self.decibels) - trend.mean(places)
+        return distances(places, places), trend.columns(places), rest[:, None]
+
     def drawn(self, most: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
         return self.at(draw_rows(self.silent, most, seed))
@@ -84,7 +99,7 @@ def trend_about_rows(rows: PowerRows, law: Law | None) -> Trend:
     """Return a trend about a law; about the mean of what was heard where that is None."""
     if law is not None:
         return Trend.about(law, torch.from_numpy(rows.places))
-    return Trend(float((rows if rows.silent.all() else rows.loud).decibels.mean()))
+    return Trend(float(rows.heard.decibels.mean()))
 
 
 @dataclass(frozen=True)
@@ -115,8 +130,7 @@ class PowerProcess(Stored):
     @property
     def trend(self) -> Trend:
         """Trend of the prior."""
-        assert self.posterior.prior.trend is not None
-        return self.posterior.prior.trend
+        return self.posterior.prior.law
 
     @property
     def places(self) -> np.ndarray:
@@ -193,7 +207,7 @@ def condition_on_powers(
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
         return _exact(rows.drawn(MOST_ROWS, seed), prior, least)
     loud = rows.loud
-    values = PlaceValues.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    values = loud.at_places()
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
     heard = float((share * (values.values[:, 0] - middle).square()).sum()) / prior.kernel.amplitude

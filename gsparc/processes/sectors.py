@@ -168,10 +168,6 @@ class SectorShadowing(Term[Tensor]):
         same = sector_of(a)[..., :, None] == sector_of(b)[..., None, :]
         return site * (distance * (-1 / wide)).exp() + same * own
 
-    def variance(self, a: Tensor) -> Tensor:
-        """See `Term`."""
-        return sum(self.shares) * a.new_ones(len(a))
-
     def parameters(self) -> Tensor:
         """Return logarithms of lengths and shares (6,)."""
         return torch.tensor([*self.lengths, *self.shares], dtype=torch.float64).log()

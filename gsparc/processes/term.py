@@ -25,9 +25,9 @@ class Term(Stored, ABC, Generic[Rows]):
     def covariance(self, a: Rows, b: Rows) -> Tensor:
         """Return the covariance (n, m) of values at rows `a` (n) and `b` (m), real or complex."""
 
-    @abstractmethod
     def variance(self, a: Rows) -> Tensor:
-        """Return the variance (n,) of values at rows `a`, the diagonal of `covariance(a, a)`."""
+        """Return the variance (n,) of values at rows `a`."""
+        return self.covariance(a, a).diagonal().real
 
     def parameters(self) -> Tensor:
         """Return what is learned of it (p,) float64, unbounded: logarithms of powers and lengths."""

@@ -127,8 +127,7 @@ class PowerField(ClosedForm):
     @property
     def trend(self) -> Trend:
         """The mean law of the first prior."""
-        assert self.priors[0][1].trend is not None
-        return self.priors[0][1].trend
+        return self.priors[0][1].law
 
     @property
     def label(self) -> str:

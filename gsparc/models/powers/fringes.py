@@ -27,7 +27,7 @@ from gsparc.models.powers.waves import (
 )
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
-from gsparc.processes.nearest import PlaceValues, condition_on_nearest
+from gsparc.processes.nearest import condition_on_nearest
 from gsparc.processes.places import of_both_ends
 from gsparc.processes.powers import MOST_ROWS as FACTORED
 from gsparc.processes.powers import PowerRows, condition_on_powers
@@ -222,8 +222,7 @@ def _apart(
     """
     error, distance = np.zeros((2, len(rows.places)))
     if many := len(rows.places) > MOST_ROWS:
-        values = PlaceValues.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
-        dense = condition_on_nearest(prior, values, seed)
+        dense = condition_on_nearest(prior, rows.at_places(), seed)
         at = dense.near.every.query(rows.places)[1]
     for part in parts:
         rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)

@@ -24,7 +24,7 @@ from gsparc.processes.censored import ConditionalGaussian, PseudoValues
 from gsparc.processes.density import LOOKS, Evidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
-from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Posterior, Prior
@@ -119,7 +119,7 @@ def candidate_priors(
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    found = fit_variogram(rows.places, _views(rows, trend)[2].numpy())
+    found = fit_variogram(rows.places, rows.beside(trend)[2].numpy())
     sill = max(found.sill, LEAST_SILL * found.total)
     kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
@@ -165,7 +165,7 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
 
 def _among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     """Errors (n,) [dB] at each place, predicted from the nearest others."""
-    values = PlaceValues.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    values = loud.at_places()
     return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
@@ -177,10 +177,7 @@ def choose_candidate(
     best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
     if not many:
         return best
-    values = PlaceValues.of(
-        rows.places, torch.from_numpy(rows.decibels)[:, None]
-    )  # given their nearest, all tell
-    kernel, how = choose_kernel_by_nearest(best.prior, values, seed)
+    kernel, how = choose_kernel_by_nearest(best.prior, rows.at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
@@ -188,7 +185,7 @@ def _settings(
     rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = (rows if rows.silent.all() else rows.loud).drawn(chosen_on, seed)
+    loud = rows.heard.drawn(chosen_on, seed)
     few = loud.drawn(COMPARED_ON, seed)
     weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
@@ -228,27 +225,14 @@ def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, fl
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
-def _views(rows: PowerRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances (n, n) [m], terms (n, P) and values less the mean (n, 1) [dB]."""
-    places = torch.from_numpy(rows.places)
-    values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return distances(places, places), trend.columns(places), values[:, None]
-
-
-def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
-) -> tuple[float, Kernel]:
-    return fit_kernel_by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks)
-
-
 def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = _views(rows, trend)
+    distance, terms, values = rows.beside(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
         return Candidate(0.0, trend, Kernel.of_one(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.of_one(scale * share, 0.1) for share in SHARES]
-    value, kernel = _by_left_out(starts, distance, terms, values)
+    value, kernel = fit_kernel_by_left_out(starts, distance, terms, values)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
@@ -256,7 +240,7 @@ def _searched(
     rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.beside(one.trend), looks=looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
@@ -269,7 +253,7 @@ def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
 
 def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = _views(rows, one.trend)
+    distance, terms, values = rows.beside(one.trend)
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
     known = ConditionalGaussian.of(gram, values[:, 0], silent)
@@ -281,7 +265,7 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
 
 def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = _views(rows, one.trend)
+    distance, terms, values = rows.beside(one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = one.kernel.bounds(distance)

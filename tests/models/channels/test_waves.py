@@ -240,7 +240,7 @@ def test_directions_in_blocks_are_those_at_once(monkeypatch):
     data = _sent(60)
     (group,), term = group_channels(data, np.arange(40), True), _prior(data)[Directions]
     whole = term.covariance(group, group)
-    monkeypatch.setattr("gsparc.models.channels.terms.directions.BLOCK", 1)
+    monkeypatch.setattr("gsparc.models.channels.terms.directions.ENTRIES", 1)
     torch.testing.assert_close(term.covariance(group, group), whole)
 
 

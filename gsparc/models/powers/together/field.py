@@ -114,8 +114,7 @@ class JointPowerField(ClosedForm):
         most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        assert self.own.never.trend is not None
-        self.heard = self.unheard = SharedTerms.over(every, self.own.never.trend, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.over(every, self.own.never.law, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
         terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)
@@ -155,8 +154,7 @@ class JointPowerField(ClosedForm):
         if self.network is None:  # sites share nothing that is learned here
             elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
-        loud = used if used.silent.all() else used.loud
-        self.whole = max(float(loud.decibels.var()), self.own.variance)
+        self.whole = max(float(used.heard.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
     def predict(self, query: Query) -> Prediction:

@@ -69,9 +69,8 @@ class StationPriors:
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
-                trend = _trend(prior)
                 shared = replace(terms, unit=process_deviation(prior))
-                wide = replace(trend, more=(*trend.more, shared))
+                wide = replace(prior.law, more=(*prior.law.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
                 known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
@@ -87,11 +86,6 @@ class StationPriors:
         return self.never.kernel.amplitude * (1 + self.never.kernel.noise)
 
 
-def _trend(prior: Prior) -> Trend:
-    assert prior.trend is not None
-    return prior.trend
-
-
 def learn_station_priors(
     rows: StationRows, seed: int, budget: TimeBudget | None = None
 ) -> tuple[StationPriors, list[str]]:
@@ -101,16 +95,15 @@ def learn_station_priors(
     their own.
     """
     trend, notes = _site_law(rows, seed)
-    heard = rows if rows.silent.all() else rows.loud
+    heard = rows.heard
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else ending_when(budget.over):
         kernel, priors = _common_settings(heard, trend, seed)
         if budget is not None and budget.over():
             numbers = []
         for number in numbers:
-            distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
-            bounds = kernel.bounds(distance)
-            _, own = fit_kernel_by_left_out([kernel], distance, columns, values, bounds, tolerance=SETTLED)
+            some = heard.of(number).thinned(ENDS_ON, seed)
+            _, own = fit_kernel_by_left_out([kernel], *some.beside(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -133,7 +126,7 @@ def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: _view(few.of(number), trend) for number in few.stations}
+    views = {number: few.of(number).beside(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
@@ -158,13 +151,6 @@ def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kerne
     }
 
 
-def _view(rows: StationRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances (n, n) [m], uncertain terms (n, Q) and values less the mean (n, 1) [dB]."""
-    places = torch.from_numpy(rows.places)
-    values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return distances(places, places), trend.columns(places), values[:, None]
-
-
 def learn_shared_terms(
     rows: StationRows, own: StationPriors, seed: int, budget: TimeBudget | None = None
 ) -> tuple[SharedTerms, float, ErrorGain | None]:
@@ -180,10 +166,10 @@ def learn_shared_terms(
         The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
         g gains at these, each after one constant, None if not tried.
     """
-    heard = rows if rows.silent.all() else rows.loud
+    heard = rows.heard
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = SharedTerms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.over(few, own.never.law, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.given(few, bare, seed).processes

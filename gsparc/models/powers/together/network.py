@@ -128,7 +128,7 @@ def learn_network(
     """
     few = rows.at(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
-    loud = few if few.silent.all() else few.loud
+    loud = few.heard
     decades = law.decades(torch.from_numpy(loud.places))
     start = replace(
         network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
