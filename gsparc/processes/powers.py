@@ -65,11 +65,11 @@ class PowerRows:
         """Those that were measured, or all where none was."""
         return self if self.silent.all() else self.loud
 
-    def at_places(self) -> PlaceValues:
+    def means_at_places(self) -> PlaceValues:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.of(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def beside(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+    def regression_about(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
         """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
@@ -130,7 +130,7 @@ class PowerProcess(Stored):
     @property
     def trend(self) -> Trend:
         """Trend of the prior."""
-        return self.posterior.prior.law
+        return self.posterior.prior.known_trend
 
     @property
     def places(self) -> np.ndarray:
@@ -207,7 +207,7 @@ def condition_on_powers(
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
         return _exact(rows.drawn(MOST_ROWS, seed), prior, least)
     loud = rows.loud
-    values = loud.at_places()
+    values = loud.means_at_places()
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
     heard = float((share * (values.values[:, 0] - middle).square()).sum()) / prior.kernel.amplitude

@@ -28,7 +28,7 @@ class Prior(Stored):
     trend: Trend | None = None
 
     @property
-    def law(self) -> Trend:
+    def known_trend(self) -> Trend:
         """The trend, where there is one."""
         assert self.trend is not None
         return self.trend

@@ -127,7 +127,7 @@ class PowerField(ClosedForm):
     @property
     def trend(self) -> Trend:
         """The mean law of the first prior."""
-        return self.priors[0][1].law
+        return self.priors[0][1].known_trend
 
     @property
     def label(self) -> str:

@@ -222,7 +222,7 @@ def _apart(
     """
     error, distance = np.zeros((2, len(rows.places)))
     if many := len(rows.places) > MOST_ROWS:
-        dense = condition_on_nearest(prior, rows.at_places(), seed)
+        dense = condition_on_nearest(prior, rows.means_at_places(), seed)
         at = dense.near.every.query(rows.places)[1]
     for part in parts:
         rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)

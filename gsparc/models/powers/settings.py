@@ -119,7 +119,7 @@ def candidate_priors(
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    found = fit_variogram(rows.places, rows.beside(trend)[2].numpy())
+    found = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
     sill = max(found.sill, LEAST_SILL * found.total)
     kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
@@ -165,7 +165,7 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
 
 def _among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     """Errors (n,) [dB] at each place, predicted from the nearest others."""
-    values = loud.at_places()
+    values = loud.means_at_places()
     return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
@@ -177,7 +177,7 @@ def choose_candidate(
     best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
     if not many:
         return best
-    kernel, how = choose_kernel_by_nearest(best.prior, rows.at_places(), seed)  # given these, all tell
+    kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
@@ -226,7 +226,7 @@ def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, fl
 
 
 def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = rows.beside(trend)
+    distance, terms, values = rows.regression_about(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
@@ -240,7 +240,7 @@ def _searched(
     rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.beside(one.trend), looks=looks)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_about(one.trend), looks=looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
@@ -253,7 +253,7 @@ def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
 
 def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.beside(one.trend)
+    distance, terms, values = rows.regression_about(one.trend)
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
     known = ConditionalGaussian.of(gram, values[:, 0], silent)
@@ -265,7 +265,7 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
 
 def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.beside(one.trend)
+    distance, terms, values = rows.regression_about(one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = one.kernel.bounds(distance)

@@ -122,7 +122,7 @@ def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
     grove = f"model.terms=[{{_target_: trees.Trees, corners: {GROVE}}}]".replace(" ", "")
     folder = tmp_path / "run"
     settings = [f"dataset.file={file}", f"hydra.run.dir={folder}", "baselines=[]", "logger=none"]
-    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=powers", *settings, grove])
+    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=gsparc", *settings, grove])
     assert answer.status == 0, answer
     log = (folder / "train.log").read_text()
     said = re.search(r"Trees: (\S+) \+- (\S+)", log)

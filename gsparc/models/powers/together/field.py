@@ -114,7 +114,7 @@ class JointPowerField(ClosedForm):
         most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        self.heard = self.unheard = SharedTerms.over(every, self.own.never.law, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.over(every, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
         terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)

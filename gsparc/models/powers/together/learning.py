@@ -70,7 +70,7 @@ class StationPriors:
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
                 shared = replace(terms, unit=process_deviation(prior))
-                wide = replace(prior.law, more=(*prior.law.more, shared))
+                wide = replace(prior.known_trend, more=(*prior.known_trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
                 known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
@@ -103,7 +103,7 @@ def learn_station_priors(
             numbers = []
         for number in numbers:
             some = heard.of(number).thinned(ENDS_ON, seed)
-            _, own = fit_kernel_by_left_out([kernel], *some.beside(trend), tolerance=SETTLED)
+            _, own = fit_kernel_by_left_out([kernel], *some.regression_about(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -126,7 +126,7 @@ def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: few.of(number).beside(trend) for number in few.stations}
+    views = {number: few.of(number).regression_about(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
@@ -169,7 +169,7 @@ def learn_shared_terms(
     heard = rows.heard
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = SharedTerms.over(few, own.never.law, LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.over(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.given(few, bare, seed).processes
