@@ -10,7 +10,7 @@ import torch
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import Values, given
+from gsparc.processes.nearest import PlaceValues, condition_on_nearest
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 
@@ -68,7 +68,7 @@ def city(count: int) -> Measurements:
         parts.append(place)
     places = np.concatenate(parts)
     prior = Prior(Kernel.matern((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
-    posterior = given(prior, Values.of(known, torch.from_numpy(powers)[:, None]), 0)
+    posterior = condition_on_nearest(prior, PlaceValues.of(known, torch.from_numpy(powers)[:, None]), 0)
     with torch.no_grad():
         decibels = posterior.mean_at(torch.from_numpy(places))[:, 0].numpy()
     decibels += CITY_NOISE_DB * rng.standard_normal(len(places))

@@ -12,24 +12,22 @@ DB_A_METRE = 0.1  # deviation before any row, of the process's: 5 dB of shadowin
 
 @dataclass(frozen=True)
 class Trees(Columns):
-    """Straight paths from `still` lose in a polygon as many decibels a metre as rows say.
+    """Straight paths lose in a polygon as many decibels a metre as rows say.
 
     Attributes:
         corners: (k, 2) of a convex polygon, counterclockwise [m].
-        still: (3,) the end that stands [m].
     """
 
     corners: list[list[float]]
-    still: list[float]
 
     def columns(self, places: Tensor) -> Tensor:
         """Return the lengths inside (n, 1), clipped edge by edge (M. Cyrus, J. Beck 1978)."""
-        corners = places.new_tensor(self.corners)
-        way = places[:, :3] - places.new_tensor(self.still)
+        corners, (end, start) = places.new_tensor(self.corners), places.split(3, 1)
+        way = end - start
         enters, leaves = torch.zeros_like(way[:, 0]), torch.ones_like(way[:, 0])
         for corner, edge in zip(corners, corners.roll(-1, 0) - corners, strict=True):
             inwards = torch.stack([-edge[1], edge[0]])
-            gap = (places.new_tensor(self.still[:2]) - corner) @ inwards  # below 0: outside
+            gap = (start[:, :2] - corner) @ inwards  # below 0: outside
             slope = way[:, :2] @ inwards
             met = -gap / torch.where(slope == 0, 1.0, slope)
             enters = torch.where(slope > 0, enters.maximum(met), enters)

@@ -311,6 +311,55 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     kind = all_methods().get(method.name)
     same = kind is not None and plain(config.model) == config_node(import_target(kind))
     return method.name if plainly and same else None
+
+
+def _of_fits(fits: FoldFits) -> dict[str, Any]:
+    cpu_s = statistics.fmean(fits.train_cpu_s)
+    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
+    said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
+    facts["model/learned"] = "\n".join(said) or None
+    if fits.cost.stages:
+        facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
+    return facts
+
+
+def _draw(
+    loggers: list[Any], config: DictConfig, facts: dict[str, Any], objects: TrainedRun, run_dir: Path
+) -> None:
+    """Draw predictions and what was found; give loggers the pictures, figures and the table."""
+    # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
+    own = {
+        f"final/{name}": value
+        for name, value in facts.items()
+        if isinstance(value, (int, float)) and not name.startswith("baseline/")
+    }
+    tracking.log_final(loggers, own)
+    method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
+    if len(fold.test):
+        title = f"{data.site.name}: test rows of {method.label}"
+        draw_predictions(method, data, fold, title, run_dir / "test.png")
+        tracking.log_picture(loggers, "test rows", run_dir / "test.png")
+    table = summary.results_table(facts, str(facts["model/label"]), prefix=config.eval_on)
+    tracking.log_table(loggers, "results", *table.texts())
+    found = method.objects()
+    if len(found):
+        draw_found(data, found, run_dir / "found.png", _known_walls(config))
+        tracking.log_picture(loggers, "found", run_dir / "found.png")
+
+
+def task(config: DictConfig) -> float:
+    """Train as configured and show the table; a job of a multirun that is done is not done again.
+
+    Returns:
+        The deciding figure, larger is better: ratios of powers as -10 log10, errors with their sign turned;
+            NaN where the data, or `split=none`, do not tell it and no search asks.
+    """
+    hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
+    if config.ckpt_path is not None:
+        words = " ".join(hydra.overrides.task)
+        log.info("with the settings of the run that it goes on from: %s", words)
+    with locked(run_dir / ".job"):  # the run's own is its training's
+        unread = State.unread(config) if job else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is None:
             begun = read_inputs(config)

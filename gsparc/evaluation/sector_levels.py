@@ -12,7 +12,7 @@ from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.terms import link_rows
+from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors
 
 MOST, ACROSS = 12, 4  # sectors drawn, those with most rows; beside each other
@@ -27,7 +27,7 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
         return False
     trend = field.own.never.trend
     assert isinstance(trend, Sectors)
-    heard = link_rows(data, rows, field.places).loud
+    heard = rows_of_stations(data, rows, field.places).loud
     count = np.bincount(heard.station, minlength=len(field.places))
     # Without an azimuth there is no angle to draw over.
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0

@@ -15,7 +15,7 @@ from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.response import SLOPE_ENDS, ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan, queries
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.features import parts_of
+from gsparc.processes.features import matern_parts
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class FrozenArray:
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
                 moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
-                self.renderer.tables, self.renderer.square, parts_of(encoding.length, encoding.kernel),
+                self.renderer.tables, self.renderer.square, matern_parts(encoding.length, encoding.kernel),
             )  # fmt: skip
             return Rendered(mean, None, unknown)
         encoded = encoding(moving)

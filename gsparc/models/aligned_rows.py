@@ -28,10 +28,10 @@ from gsparc.data.splits import Fold
 from gsparc.models.target_rows import TINY_POWER
 from gsparc.physics.row_factors import Freedom, alignment_factors, freedom_words
 from gsparc.processes.averages import mean_at_places
-from gsparc.processes.kernel import IsotropicWaves, Kernel
-from gsparc.processes.nearest import weights_of
-from gsparc.processes.neighbourhood import covering, spacing
-from gsparc.processes.two_lengths import first_kernel, two_lengths
+from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
+from gsparc.processes.nearest import neighbour_weights
+from gsparc.processes.neighbourhood import covering_rows, spacing
+from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 
 log = logging.getLogger(__name__)
 
@@ -175,7 +175,7 @@ class _Rows:
         """Factors (n, K) that turn each row to the next of a tree of near places, about a direct wave."""
         values = self.values if direct is None else self.values * direct.conj()
         factors = np.ones((len(values), len(self.tones)), np.complex128)
-        trunk = covering(self.places, TREE, 0)
+        trunk = covering_rows(self.places, TREE, 0)
         # A distance of 0 would be no edge, and several rows may lie at one place.
         tree = minimum_spanning_tree(cdist(self.places[trunk], self.places[trunk]) + 1e-12)
         order, before = breadth_first_order(tree, 0, directed=False)
@@ -196,19 +196,19 @@ class _Rows:
 
     def smooth(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by a process of two lengths; return the round that tells rows best."""
-        kernel, found = first_kernel(self.length, spacing(self.places)), []
+        kernel, found = initial_kernel(self.length, spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._swept(factors, self._weights(kernel), SWEEPS)
             found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "neighbours"))
             turned = (self.values * factors[:, None]).reshape(len(factors), -1)
-            kernel = two_lengths(self.places, turned, self.length, kernel)
+            kernel = fit_two_lengths(self.places, turned, self.length, kernel)
         return min(found, key=lambda each: each.error)
 
     def waves(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by waves from everywhere alike."""
         # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
-        weights = self._weights(Kernel((waves,), WAVE_NOISE))
+        weights = self._weights(Kernel((waves, WhiteNoise(WAVE_NOISE))))
         factors = self._swept(factors, weights, WAVE_SWEEPS)
         return Alignment(factors, self._error(factors, weights), "carrier")
 
@@ -222,7 +222,7 @@ class _Rows:
         for part in np.array_split(np.arange(len(near)), -(-len(near) // AT_ONCE)):
             at, around = torch.from_numpy(self.places[part]), torch.from_numpy(self.places[near[part]])
             noise = torch.full(around.shape[:2], float(kernel.noise), dtype=torch.float64)
-            weight[part] = weights_of(kernel, at, around, noise)[0].numpy()
+            weight[part] = neighbour_weights(kernel, at, around, noise)[0].numpy()
         count, starts = len(near), np.arange(len(near) + 1) * near.shape[1]
         return csr_array((weight.ravel(), near.ravel(), starts), (count, count))
 

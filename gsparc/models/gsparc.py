@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -14,6 +15,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, import_path
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
+from gsparc.models.powers.own_terms import as_terms
 from gsparc.models.refined_places import errors_of
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
@@ -54,6 +56,8 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
             (True, ImageProcess),
         )
         kind = next(kind for called, kind in table if called)
+        if settings.own_terms and kind is not Powers:
+            raise ValueError(f"model.terms are of received powers; model={kind.name} is called for here")
         rendered = issubclass(kind, ImageProcess)
         if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
@@ -78,6 +82,7 @@ class Gsparc(LearnsTogether):
     Args:
         effects: switches of terms.
         position_std: of each coordinate of training positions [m]; None: as the data say.
+        terms: further `Columns` of one station's powers.
         name: as it appears in tables.
         **field: see `LearnedField`.
     """
@@ -85,18 +90,19 @@ class Gsparc(LearnsTogether):
     hands_on: ClassVar[type[Method]] = LearnedField  # whose settings `field` are
     resumable = uses_censored = True
     stored_names: ClassVar[dict[str, str]] = {
-        "steps": "", "position_std": "", "loss.snapshot": "init.snapshot", "refit": "rendered.refit",
-        "keep_best": "rendered.keep_best",
+        "steps": "", "position_std": "", "terms": "", "loss.snapshot": "init.snapshot",
+        "refit": "rendered.refit", "keep_best": "rendered.keep_best",
     }  # fmt: skip
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        name: str = "gsparc", **field: Any,
+        terms: Sequence[Any] = (), name: str = "gsparc", **field: Any,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
+        self.own_terms = as_terms(terms)
 
     def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`; the log says what was chosen."""
@@ -112,7 +118,8 @@ class Gsparc(LearnsTogether):
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
-            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone)
+            own = {"terms": self.own_terms} if solved[target] is Powers else {}
+            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **own)
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:
             raise ValueError(f"model=gsparc makes no {target}: train again")

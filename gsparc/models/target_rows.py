@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.data.blocks import take
 from gsparc.data.schema import Kind, Measurements
-from gsparc.processes.powers import Rows
+from gsparc.processes.powers import PowerRows
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 DECIBELS_PER_NAT = 10 / math.log(10)
@@ -85,7 +85,7 @@ def unheard_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
 
-def power_rows(data: Measurements, rows: np.ndarray) -> Rows:
+def power_rows(data: Measurements, rows: np.ndarray) -> PowerRows:
     """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
-    return Rows(data.moving[rows], decibels, data.side(rows))
+    return PowerRows(data.moving[rows], decibels, data.side(rows))

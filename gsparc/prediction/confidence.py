@@ -16,7 +16,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.baselines.gp import choose_kernel, principal_components
+from gsparc.models.baselines.gp import choose_kernel_by_left_out, principal_components
 from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
@@ -90,7 +90,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
-    return choose_kernel(data.moving[few], parts.scores, len(parts.mean))
+    return choose_kernel_by_left_out(data.moving[few], parts.scores, len(parts.mean))
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:

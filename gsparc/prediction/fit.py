@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def fit(
     rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
     unit: str = "dBm", model: str = "gsparc", effort: float = 1.0, budget_s: float | None = None,
     seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None,
-    align: str = "auto", **arrays: Any,
+    terms: Sequence[Any] | Any = (), align: str = "auto", **arrays: Any,
 ) -> Predictor:  # fmt: skip
     """Fit a model to all rows, ready to be asked; checks and messages are those of a file of one's own.
 
@@ -53,6 +54,7 @@ def fit(
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
         settings: arguments of the model's class.
+        terms: further terms of one station's powers, see `docs/terms.md`; of gsparc and powers.
         align: what of each row's factor is free in channels: `none`, `phase`, `phase+delay` or
             `phase+delay+gain`; `auto`: as neighbouring rows say.
         **arrays: anything else of the schema of `docs/reference/schema.md`: `carrier_hz`, `frequency_hz`,
@@ -73,7 +75,7 @@ def fit(
     data = set_freedom(reading.data, align)
     for note in reading.notes:
         log.warning("%s", note)
-    kind, own = method_class(model), settings or {}
+    kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
     for name in own.keys() - accepted_arguments(kind):
         raise ValueError(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"

@@ -37,13 +37,13 @@ def mean_at_places(
     return first, (total / np.maximum(heard, 1).astype(kind)).reshape(-1, *values.shape[1:]), count
 
 
-def mixture(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Return mean (n, ...) and variance (n,) of a mixture of shares, means (n, ...) and variances (n,).
 
     What the members disagree about is part of the variance, mean over entries (law of total variance).
 
     >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
-    >>> mixture([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
+    >>> mixture_moments([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
     (tensor([-75.]), tensor([29.]))
     """
     if len(parts) == 1:

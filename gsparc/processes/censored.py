@@ -26,7 +26,7 @@ CERTAIN = 4.0  # standard deviations below its level: being told so changes noth
 
 
 @dataclass(frozen=True)
-class Sites:
+class PseudoValues:
     """Gaussian stand-ins of the factors of m censored rows.
 
     Attributes:
@@ -42,10 +42,10 @@ class Sites:
     settled: bool
 
 
-def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
+def truncated_normal_moments(z: Tensor) -> tuple[Tensor, Tensor]:
     """Return, of a standard normal cut off above z (n,), minus its mean, and the share of its variance lost.
 
-    >>> truncated(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
+    >>> truncated_normal_moments(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
     (tensor([0.7979]), tensor([0.6366]))
     """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
@@ -57,13 +57,13 @@ def truncated(z: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
 
 
-def propagate(
+def expectation_propagation(
     known: ConditionalGaussian,
     level: Tensor,
     side: Tensor | float = 1.0,
-    start: Sites | None = None,
+    start: PseudoValues | None = None,
     within: float = SETTLED,
-) -> Sites:
+) -> PseudoValues:
     """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
     Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same. They end
@@ -94,13 +94,13 @@ def propagate(
     evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
     evidence += torch.special.log_ndtr(side * (level - cavity) / cavity_variance.sqrt()).sum()
     evidence += 0.5 * (apart.log() + (cavity - value).square() / apart).sum()
-    return Sites(value, variance, float(evidence), settled)
+    return PseudoValues(value, variance, float(evidence), settled)
 
 
 def _sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
     """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
-    ratio, lost = truncated(side * (level - mean) / deviation)
+    ratio, lost = truncated_normal_moments(side * (level - mean) / deviation)
     return mean - side * deviation * ratio / lost, variance * (1 - lost) / lost
 
 
@@ -144,7 +144,7 @@ class ConditionalGaussian:
 
 
 def log_evidence(
-    gram: Tensor, values: Tensor, side: Tensor, last: list[Sites] | None = None
+    gram: Tensor, values: Tensor, side: Tensor, last: list[PseudoValues] | None = None
 ) -> tuple[float, Tensor, Tensor]:
     """Return the logarithm of the probability of known values and of the rest beyond their levels.
 
@@ -172,7 +172,7 @@ def log_evidence(
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
     begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
-    sites = propagate(known, values[unknown], side[unknown], begin, within)
+    sites = expectation_propagation(known, values[unknown], side[unknown], begin, within)
     if last is not None:
         last[:] = [sites]
     # A stand-in is a measurement whose noise is its own variance.

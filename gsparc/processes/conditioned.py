@@ -14,7 +14,7 @@ from typing import Literal
 from torch import Tensor
 
 from gsparc.processes.factor import Factor, as_pairs
-from gsparc.processes.left_out import left_out, left_out_signal
+from gsparc.processes.left_out import left_out_residuals, left_out_signal
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Conditioned:
 
     def mean(self, cross: Tensor) -> Tensor:
         """Return the mean (m, R) at places whose covariances with the rows are (m, n)."""
-        return weighted(cross, self.weights)
+        return weighted_sum(cross, self.weights)
 
     def known(self, cross: Tensor) -> Tensor:
         """Return what the rows take from the variance (m,) of places of covariances (m, n) with them."""
@@ -75,7 +75,7 @@ class Conditioned:
     def left_out(self, groups: Iterable[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Return residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
         inverse = self.factor.precision if groups is None else self.factor.inverse
-        return left_out(inverse, self.weights, groups)
+        return left_out_residuals(inverse, self.weights, groups)
 
     def left_out_signal(
         self, disturbance: Tensor, groups: Iterable[Tensor] | None = None
@@ -84,7 +84,7 @@ class Conditioned:
         return left_out_signal(self.factor.inverse, self.weights, disturbance, groups)
 
 
-def weighted(cross: Tensor, weights: Tensor) -> Tensor:
+def weighted_sum(cross: Tensor, weights: Tensor) -> Tensor:
     """Return `cross @ weights` (..., m, R); covariances (..., m, n) may be real and weights complex."""
     if weights.is_complex() and not cross.is_complex():
         return as_pairs(lambda pairs: cross @ pairs, weights)

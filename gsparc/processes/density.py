@@ -18,11 +18,12 @@ from scipy.linalg import blas
 from scipy.optimize import minimize
 from torch import Tensor
 
-from gsparc.processes.censored import Sites, log_evidence
+from gsparc.processes.censored import PseudoValues, log_evidence
 from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.worker import stop_when_late
 
+LOOKS, SETTLED = 40, 5e-6  # of a walk: most evaluations, and the relative gain of a step that is the last
 BAD = 1e12  # in place of a density where no Cholesky factor exists
 TINY = np.finfo(float).tiny
 
@@ -82,7 +83,7 @@ class Evidence(torch.autograd.Function):
     """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
-    def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor, last: list[Sites]) -> Tensor:
+    def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor, last: list[PseudoValues]) -> Tensor:
         """See `log_evidence`."""
         value, slope, weights = log_evidence(gram.detach(), values.detach(), side, last)
         ctx.save_for_backward(slope, weights)
@@ -116,10 +117,10 @@ class Profiled(torch.autograd.Function):
         return slopes[0] * ctx.saved_tensors[0], None
 
 
-def gram_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
+def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
     """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
-    >>> gram_of(Kernel.of_one(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
+    >>> covariance_of(Kernel.of_one(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
     tensor([[1.5000]], dtype=torch.float64)
 
     Args:
@@ -133,13 +134,13 @@ def gram_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> 
     return total + kernel.noise * torch.eye(len(distance), dtype=distance.dtype)
 
 
-def walked(
+def minimise(
     objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
 
-    >>> best, value = walked(lambda at: (at - 3).square().sum(), [np.zeros(1)], [(-5.0, 5.0)], 50, 1e-12)
+    >>> best, value = minimise(lambda at: (at - 3).square().sum(), [np.zeros(1)], [(-5.0, 5.0)], 50, 1e-12)
     >>> best.round(3), round(value, 3)
     (array([3.]), 0.0)
 
@@ -175,36 +176,37 @@ def walked(
     return result.x, float(result.fun)
 
 
-def learned(
+def fit_kernel(
     objective: Callable[[Kernel], tuple[Tensor, Tensor]], starts: Sequence[Kernel],
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find where an objective of kernels is least, and the kernel there, from the best of `starts` on.
 
     Args:
         objective: its value, with autograd, and the best amplitude.
         starts: of terms of one kind.
-        bounds, looks, tolerance: see `walked`.
+        bounds, looks, tolerance: see `minimise`.
     """
     first, points = starts[0], [one.parameters().numpy() for one in starts]
-    best, _ = walked(lambda at: objective(first.at(at))[0], points, bounds, looks, tolerance)
+    best, _ = minimise(lambda at: objective(first.at(at))[0], points, bounds, looks, tolerance)
     with torch.no_grad():
         kernel = first.at(torch.from_numpy(best))
         value, amplitude = objective(kernel)
     return float(value), replace(kernel, amplitude=float(amplitude))
 
 
-def by_left_out(
+def fit_kernel_by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
-    bounds: Sequence[tuple[float, float]], looks: int, tolerance: float,
+    bounds: Sequence[tuple[float, float]] = (), looks: int = LOOKS, tolerance: float = SETTLED,
     entries: int = 1, bounded: bool = True,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel."""
 
     def objective(kernel: Kernel) -> tuple[Tensor, Tensor]:
-        gram = gram_of(kernel, distance, columns)
+        gram = covariance_of(kernel, distance, columns)
         value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
         return value / len(values), amplitude
 
-    value, kernel = learned(objective, starts, bounds, looks, tolerance)
+    bounds = bounds or starts[0].bounds(distance)
+    value, kernel = fit_kernel(objective, starts, bounds, looks, tolerance)
     return value * len(values), kernel

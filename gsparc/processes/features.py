@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import ROUGH_RATIO, ROUGH_SHARE, Shadowing, SmoothRough, apart
+from gsparc.processes.kernel import ROUGH_RATIO, ROUGH_SHARE, Shadowing, SmoothRough, distances
 
 Correlation = Literal["matern32", "smooth_rough"]
 TERMS = {"matern32": Shadowing, "smooth_rough": SmoothRough}
@@ -36,10 +36,10 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     """
     if name not in TERMS:
         raise ValueError(f"correlation {name!r} is none of {', '.join(TERMS)}")
-    return TERMS[name](length).correlation(apart(a, b))
+    return TERMS[name](length).correlation(distances(a, b))
 
 
-def parts_of(length: float, name: Correlation) -> tuple[float, float, float, float]:
+def matern_parts(length: float, name: Correlation) -> tuple[float, float, float, float]:
     """Return share and length [m] of a correlation's Matern-5/2, share and length of its Matern-3/2."""
     if name == "matern32":
         return 0.0, length, 1.0, length
@@ -47,7 +47,7 @@ def parts_of(length: float, name: Correlation) -> tuple[float, float, float, flo
 
 
 @dataclass(frozen=True)
-class Whitened:
+class Features:
     """Features of a process, and what maps values at its rows to their weights.
 
     Attributes:
@@ -61,11 +61,11 @@ class Whitened:
     weigh: Tensor
 
 
-def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most: int) -> Whitened:
+def whitened_features(rows: Tensor, length: float, noise: float, name: Correlation, most: int) -> Features:
     """Return features of a process conditioned on rows (n, 3) [m], at `most` places; exact up to that many.
 
     >>> rows = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
-    >>> known = whitened(rows, length=2.0, noise=0.01, name="matern32", most=10)
+    >>> known = whitened_features(rows, length=2.0, noise=0.01, name="matern32", most=10)
     >>> known.places.shape, known.whitening.shape, known.weigh.shape
     (torch.Size([2, 3]), torch.Size([2, 2]), torch.Size([2, 2]))
 
@@ -81,14 +81,16 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
         gram.diagonal().add_(noise)
         root = Factor.of(gram).root
         # C = L^-T, as C C^T is to be the inverse of the covariance.
-        return Whitened(rows, root.T.contiguous(), root)
-    return with_places(
+        return Features(rows, root.T.contiguous(), root)
+    return features_at_places(
         rows[pivoted_rows(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name
     )
 
 
-def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Whitened:
-    """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened`."""
+def features_at_places(
+    places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation
+) -> Features:
+    """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened_features`."""
     own = correlation(places, places, length, name)
     own.diagonal().add_(JITTER)
     factor = Factor.of(own)
@@ -99,7 +101,7 @@ def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name:
     back = factor.root.T @ turn
     whitening = back * (size / (noise + size)).sqrt()
     weigh = (turn / (size * (noise + size)).sqrt()).T @ seen
-    return Whitened(places, whitening.contiguous(), weigh)
+    return Features(places, whitening.contiguous(), weigh)
 
 
 def pivoted_rows(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:

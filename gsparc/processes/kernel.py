@@ -6,7 +6,8 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from itertools import chain
+from typing import ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -25,12 +26,12 @@ COMPILED = 2  # terms that compiled kernels sum
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
-def apart(a: Tensor, b: Tensor) -> Tensor:
+def distances(a: Tensor, b: Tensor) -> Tensor:
     """Return distances (..., n, m) [m] of places (..., n, D) and (..., m, D), with gradients; exact at 0.
 
     Differences are formed before squaring: the expanded form loses millimetres in float32.
 
-    >>> apart(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
+    >>> distances(torch.zeros(1, 3), torch.tensor([[3.0, 4.0, 0.0]]))
     tensor([[5.]])
     """
     if not needs_reference(a, b):
@@ -81,7 +82,7 @@ class Stationary(Term[Tensor]):
 
     length: Tensor | float
     share: Tensor | float = 1.0
-    by_distance: ClassVar[bool] = True  # also where both ends move
+    by_distance: ClassVar[bool] = True
     compiled: ClassVar[int] = 0  # sign of its length in compiled kernels; 0: they do not know it
 
     @abstractmethod
@@ -90,11 +91,7 @@ class Stationary(Term[Tensor]):
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """See `Term`."""
-        return self.share * self.correlation(apart(a, b))
-
-    def variance(self, a: Tensor) -> Tensor:
-        """See `Term`."""
-        return self.share * a.new_ones(len(a))
+        return self.share * self.correlation(distances(a, b))
 
     def parameters(self) -> Tensor:
         """Return the logarithm of the length (1,); shares are learned by the sum."""
@@ -106,7 +103,7 @@ class Stationary(Term[Tensor]):
 
     def at(self, parameters: Tensor) -> Self:
         """See `Term`."""
-        return replace(self, length=_number(parameters[0].exp()))
+        return replace(self, length=to_number(parameters[0].exp()))
 
 
 class Shadowing(Stationary):
@@ -172,13 +169,41 @@ class IsotropicWaves(Stationary):
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
         ends = zip(a.split(3, -1), b.split(3, -1), strict=True)
-        first, *other = (self.correlation(apart(*pair)) for pair in ends)
+        first, *other = (self.correlation(distances(*pair)) for pair in ends)
         return first * other[0] if other else first
 
 
 @dataclass(frozen=True)
+class WhiteNoise(Term[Tensor]):
+    """Noise of each measurement alone, also of several at one place.
+
+    Attributes:
+        share: variance, of that of all other terms of a kernel.
+    """
+
+    share: Tensor | float
+
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """See `Term`; 0 between rows that are not the same ones."""
+        alike = a.new_zeros(len(a), len(b))
+        return self.share * (alike.fill_diagonal_(1.0) if a is b else alike)
+
+    def parameters(self) -> Tensor:
+        """Return the logarithm of the share (1,)."""
+        return torch.tensor([self.share], dtype=torch.float64).log()
+
+    def bounds(self, scale: float) -> list[tuple[float, float]]:
+        """See `Term`."""
+        return [(math.log(NOISE_SPAN[0]), math.log(NOISE_SPAN[1]))]
+
+    def at(self, parameters: Tensor) -> Self:
+        """See `Term`."""
+        return replace(self, share=to_number(parameters[0].exp()))
+
+
+@dataclass(frozen=True)
 class Kernel(Stored):
-    """`amplitude (sum of terms + noise identity)`.
+    """`amplitude (sum of terms)`, white noise the last of them.
 
     >>> kernel = Kernel.matern(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
     >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))  # one place: its variance and that of the noise
@@ -187,38 +212,46 @@ class Kernel(Stored):
     True
 
     Attributes:
-        terms: whose shares sum to 1; several of distance alone, or one.
-        noise: variance relative to `amplitude`.
-        amplitude: variance of a value.
+        terms: signals whose shares sum to 1, several of distance alone or one; then `WhiteNoise`.
+        amplitude: variance of a value without noise.
     """
 
-    terms: tuple[Stationary, ...]
-    noise: float  # a tensor while it is learned
+    terms: tuple[Term[Tensor], ...]
     amplitude: float = 1.0
 
     @classmethod
     def of_one(
         cls, length: float, noise: float, amplitude: float = 1.0, term: type[Stationary] = Shadowing
     ) -> Self:
-        """Return a kernel of one term of a length [m]."""
-        return cls((term(length),), noise, amplitude)
+        """Return a kernel of one term of a length [m] and of noise."""
+        return cls((term(length), WhiteNoise(noise)), amplitude)
 
     @classmethod
     def matern(
         cls, lengths: Sequence[float], shares: Sequence[float], noise: float, amplitude: float = 1.0
     ) -> Self:
-        """Return a kernel of several `Shadowing`."""
-        return cls(tuple(map(Shadowing, lengths, shares)), noise, amplitude)
+        """Return a kernel of several `Shadowing` and of noise."""
+        return cls((*map(Shadowing, lengths, shares), WhiteNoise(noise)), amplitude)
+
+    @property
+    def signals(self) -> tuple[Stationary, ...]:
+        """Terms of distance without the noise."""
+        return cast(tuple[Stationary, ...], self.terms[:-1])
+
+    @property
+    def noise(self) -> float:
+        """Variance of the noise, relative to `amplitude`; a tensor while it is learned."""
+        return cast(WhiteNoise, self.terms[-1]).share  # type: ignore[return-value]
 
     @property
     def lengths(self) -> tuple[float, ...]:
         """Lengths of the terms [m]."""
-        return tuple(float(term.length) for term in self.terms)
+        return tuple(float(term.length) for term in self.signals)
 
     @property
     def shares(self) -> tuple[float, ...]:
         """Shares of the terms."""
-        return tuple(float(term.share) for term in self.terms)
+        return tuple(float(term.share) for term in self.signals)
 
     @property
     def length(self) -> float:
@@ -228,7 +261,7 @@ class Kernel(Stored):
     @property
     def compiled(self) -> list[float] | None:
         """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
-        signed = [term.compiled * float(term.length) for term in self.terms]
+        signed = [term.compiled * float(term.length) for term in self.signals]
         return signed if all(signed) and len(signed) <= COMPILED else None
 
     @property
@@ -238,14 +271,14 @@ class Kernel(Stored):
 
     def correlation(self, distance: Tensor) -> Tensor:
         """Return correlations at distances (...) [m]."""
-        if len(self.terms) == 1:
-            return self.terms[0].correlation(distance)
-        first, *others = (term.share * term.correlation(distance) for term in self.terms)
+        if len(self.signals) == 1:
+            return self.signals[0].correlation(distance)
+        first, *others = (term.share * term.correlation(distance) for term in self.signals)
         return sum(others, first)
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(apart(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
+        return self.correlation(distances(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
@@ -254,10 +287,10 @@ class Kernel(Stored):
         return result
 
     def parameters(self) -> Tensor:
-        """Return logarithms of lengths and noise, between them those of shares relative to the last."""
-        shares, noise = torch.tensor(self.shares).double().log(), torch.tensor([self.noise]).double().log()
-        lengths = [term.parameters() for term in self.terms]
-        return torch.cat([*lengths, shares[:-1] - shares[-1], noise])
+        """Return those of all signals, logarithms of shares relative to the last, that of the noise."""
+        *signals, noise = (term.parameters() for term in self.terms)
+        shares = torch.tensor(self.shares if len(signals) > 1 else [1.0], dtype=torch.float64).log()
+        return torch.cat([*signals, shares[:-1] - shares[-1], noise])
 
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
         """Return bounds of the parameters, for rows at distances (...) [m].
@@ -267,21 +300,22 @@ class Kernel(Stored):
         """
         # All rows may stand at one place, whose distances are 0.
         scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
-        lengths = [bound for term in self.terms for bound in term.bounds(scale)]
-        shares = [(-SHARES, SHARES)] * (len(self.terms) - 1)
-        return [*lengths, *shares, (math.log(NOISE_SPAN[0]), math.log(NOISE_SPAN[1]))]
+        *lengths, noise = (term.bounds(scale) for term in self.terms)
+        shares = [(-SHARES, SHARES)] * (len(lengths) - 1)
+        return [*chain(*lengths), *shares, *noise]
 
     def at(self, parameters: Tensor) -> Self:
         """Return the kernel of other parameters; numbers are tensors where gradients flow."""
-        count = len(self.terms)
-        lengths, logits, noise = parameters.split((count, count - 1, 1))
-        # Of logits all shares lie between 0 and 1, whatever a step does.
-        shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
-        given = zip(self.terms, lengths.split(1), shares, strict=True)
-        terms = tuple(replace(term.at(length), share=_number(share)) for term, length, share in given)
-        return replace(self, terms=terms, noise=_number(noise[0].exp()))  # type: ignore[arg-type]
+        sizes, count = [len(term.parameters()) for term in self.terms], len(self.terms) - 1
+        *numbers, logits, noise = parameters.split([*sizes[:-1], count - 1, sizes[-1]])
+        signals = tuple(term.at(own) for term, own in zip(self.signals, numbers, strict=True))
+        if count > 1:
+            # Of logits all shares lie between 0 and 1, whatever a step does.
+            shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
+            signals = tuple(replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True))
+        return replace(self, terms=(*signals, self.terms[-1].at(noise)))
 
 
-def _number(value: Tensor) -> Tensor | float:
+def to_number(value: Tensor) -> Tensor | float:
     """A tensor () as it is where gradients flow, else its number."""
     return value if value.requires_grad else float(value)

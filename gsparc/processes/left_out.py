@@ -17,13 +17,13 @@ from gsparc.processes.factor import Factor
 ENTRIES = 2_000_000  # of systems solved at a time: memory
 
 
-def left_out(
+def left_out_residuals(
     inverse: Tensor, weights: Tensor, groups: Iterable[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return residuals, shaped as the weights, and their variances (n,).
 
     >>> inverse = torch.tensor([[2.0, 1.0], [1.0, 2.0]]).inverse()
-    >>> residual, variance = left_out(inverse, inverse @ torch.tensor([[3.0], [3.0]]))
+    >>> residual, variance = left_out_residuals(inverse, inverse @ torch.tensor([[3.0], [3.0]]))
     >>> residual.T, variance
     (tensor([[1.5000, 1.5000]]), tensor([1.5000, 1.5000]))
 
@@ -43,7 +43,7 @@ def left_out(
 
 
 def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s); see `left_out`."""
+    """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s)."""
     block = Factor.of(inverse[rows[:, None], rows])
     return block.solved(weights[rows]), block.inverse
 
@@ -78,10 +78,10 @@ def left_out_signal(
     """Return each row less the signal predicted from all others (n, R), and its variance (n,) without groups.
 
     With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r` with the
-    residual r of `left_out`: what disturbs others by their order alone is not predicted.
+    residual r of `left_out_residuals`: what disturbs others by their order alone is not predicted.
 
     Args:
-        inverse, weights, groups: as in `left_out`.
+        inverse, weights, groups: as in `left_out_residuals`.
         disturbance: N (n, n), covariance of what is no signal.
     """
     if groups is None:
@@ -95,10 +95,10 @@ def left_out_signal(
     return residual, None
 
 
-def groups_of(number: np.ndarray) -> list[Tensor]:
+def rows_of_groups(number: np.ndarray) -> list[Tensor]:
     """Return the rows of each group by their numbers (n,).
 
-    >>> groups_of(np.array([7, 3, 7]))
+    >>> rows_of_groups(np.array([7, 3, 7]))
     [tensor([1]), tensor([0, 2])]
     """
     return [torch.from_numpy(np.flatnonzero(number == one)) for one in np.unique(number)]

@@ -24,10 +24,16 @@ from torch import Tensor
 from gsparc.ops.queries import has_query_kernel, nearest_weights
 from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import mean_at_places
-from gsparc.processes.density import learned
+from gsparc.processes.density import TINY, fit_kernel
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
-from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, covering, nearest_distance, with_nearest
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.neighbourhood import (
+    NEIGHBOURS,
+    Neighbourhood,
+    covering_rows,
+    nearest_distance,
+    rows_with_nearest,
+)
 from gsparc.processes.prior import Answer, Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
@@ -38,12 +44,10 @@ LOOKED_AT = 1_200  # places whose density given their neighbours chooses the set
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
-LOOKS, SETTLED = 40, 5e-6
 EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
-TINY = 1e-30  # an amplitude has a logarithm
 
 
-def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+def kriging_weights(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
     """Return weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
 
     Args:
@@ -54,18 +58,18 @@ def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
     return weights, (weights * cross).sum(-1)
 
 
-def weights_of(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def neighbour_weights(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D) of `noise` (B, k)."""
     gram = kernel.between(near, near)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
-    return solved(gram, kernel.between(places[:, None], near)[:, 0])
+    return kriging_weights(gram, kernel.between(places[:, None], near)[:, 0])
 
 
 @dataclass(frozen=True)
-class Values:
+class PlaceValues:
     """Places, each once, and what was measured there.
 
-    >>> values = Values.of(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
+    >>> values = PlaceValues.of(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
     >>> values.values, values.count  # two rows of one place
     (tensor([[2.]], dtype=torch.float64), tensor([2.], dtype=torch.float64))
 
@@ -80,7 +84,7 @@ class Values:
     count: Tensor
 
     @classmethod
-    def of(cls, places: np.ndarray, values: Tensor) -> Values:
+    def of(cls, places: np.ndarray, values: Tensor) -> PlaceValues:
         """Average rows at (n, D) with values (n, P) over each place."""
         first, mean, count = mean_at_places(places, values.numpy())
         return cls(places[first], torch.from_numpy(mean), torch.from_numpy(count).double())
@@ -165,14 +169,14 @@ class Nearest(Posterior):
         return Answer(mean, left.clamp_min(0.0))
 
     def _weights(self, queries: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Of rows (B, k), see `weights_of`."""
+        """Of rows (B, k), see `neighbour_weights`."""
         kernel = self.prior.kernel
         if (lengths := kernel.compiled) and has_query_kernel(queries):
             result = nearest_weights(queries, self.places, self._solvable, index, lengths, kernel.shares)
             if result is None:
                 raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
             return result
-        return weights_of(kernel, queries, self.places[index], self.noise[index])
+        return neighbour_weights(kernel, queries, self.places[index], self.noise[index])
 
     @cached_property
     def _columns(self) -> Tensor:
@@ -193,15 +197,15 @@ class Nearest(Posterior):
         return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
 
-def given(
-    prior: Prior, values: Values, seed: int, more: Values | None = None, extra: Tensor | None = None,
-    most: int = NEIGHBOURS,
+def condition_on_nearest(
+    prior: Prior, values: PlaceValues, seed: int, more: PlaceValues | None = None,
+    extra: Tensor | None = None, most: int = NEIGHBOURS,
 ) -> Nearest:  # fmt: skip
     """Return the process given places, with settings as they are.
 
     >>> line = np.linspace(0.0, 9.0, 10)[:, None]
-    >>> values = Values.of(line, torch.from_numpy(np.sin(line)))
-    >>> posterior = given(Prior(Kernel.of_one(3.0, 1e-4)), values, seed=0, most=4)
+    >>> values = PlaceValues.of(line, torch.from_numpy(np.sin(line)))
+    >>> posterior = condition_on_nearest(Prior(Kernel.of_one(3.0, 1e-4)), values, seed=0, most=4)
     >>> posterior.approximation, posterior.answer(torch.tensor([[4.5]], dtype=torch.float64)).mean.shape
     ('Vecchia 4', torch.Size([1, 1]))
 
@@ -217,7 +221,7 @@ def given(
     noise, every = prior.kernel.noise / values.count, values
     if more is not None and extra is not None:
         noise = torch.cat([noise, prior.kernel.noise + extra])
-        every = Values(
+        every = PlaceValues(
             np.concatenate([values.places, more.places]),
             torch.cat([values.values, more.values]),
             torch.cat([values.count, more.count]),
@@ -228,13 +232,13 @@ def given(
         return Nearest(prior, near, every.values, noise, none, none[:, :0], most)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
-    chosen = covering(every.places, COVER, seed)
-    terms, spread = weighed(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    chosen = covering_rows(every.places, COVER, seed)
+    terms, spread = fit_trend_weights(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
     return Nearest(prior, near, rest, noise, terms, spread, most)
 
 
 @torch.no_grad()
-def weighed(
+def fit_trend_weights(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
@@ -263,7 +267,7 @@ def weighed(
         for a in range(start, end, WHITENED):
             block = slice(a, min(a + WHITENED, end))
             row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))[1]
-            shares, known = weights_of(kernel, at[block], at[row], noise[row])
+            shares, known = neighbour_weights(kernel, at[block], at[row], noise[row])
             left = (1 + noise[block] - known).sqrt()
             white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
         start = end
@@ -275,7 +279,7 @@ def weighed(
 
 
 @dataclass(frozen=True)
-class Sample:
+class NeighbourSample:
     """Rows with their nearest others.
 
     Attributes:
@@ -293,19 +297,19 @@ class Sample:
     counts: Tensor
 
     @classmethod
-    def of(cls, places: Tensor, values: Tensor, counts: Tensor) -> Sample:
+    def of(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
         """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
-        between = apart(places, places)
+        between = distances(places, places)
         return cls(
             between[:, 0, 1:], between[:, 1:, 1:], values[:, 0], values[:, 1:], counts[:, 0], counts[:, 1:]
         )
 
 
-def density_given_nearest(kernel: Kernel, sample: Sample) -> tuple[Tensor, Tensor]:
+def density_given_nearest(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
     """Return the negative log density, mean over rows [nats], and the best amplitude."""
     noise = kernel.noise
     gram = kernel.correlation(sample.apart) + torch.diag_embed(noise / sample.counts + JITTER)
-    weights, known = solved(gram, kernel.correlation(sample.far))
+    weights, known = kriging_weights(gram, kernel.correlation(sample.far))
     variance = 1 + noise / sample.count - known
     squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
     amplitude = (squared / variance).mean().clamp_min(TINY)
@@ -315,7 +319,7 @@ def density_given_nearest(kernel: Kernel, sample: Sample) -> tuple[Tensor, Tenso
     return density + EXCESS * excess.square() / len(variance), amplitude
 
 
-def most_likely_given_nearest(starts: list[Kernel], sample: Sample, distance: np.ndarray) -> Kernel:
+def most_likely_given_nearest(starts: list[Kernel], sample: NeighbourSample, distance: np.ndarray) -> Kernel:
     """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
 
     Args:
@@ -324,10 +328,10 @@ def most_likely_given_nearest(starts: list[Kernel], sample: Sample, distance: np
         distance: between rows of the whole site [m], for bounds of lengths.
     """
     bounds = starts[0].bounds(torch.from_numpy(distance))
-    return learned(lambda one: density_given_nearest(one, sample), starts, bounds, LOOKS, SETTLED)[1]
+    return fit_kernel(lambda one: density_given_nearest(one, sample), starts, bounds)[1]
 
 
-def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
+def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
     Neighbours are looked for among all places, among an eighth of them, and so on: what is near shows the
@@ -341,20 +345,20 @@ def settings_of(prior: Prior, values: Values, seed: int) -> tuple[Kernel, str]:
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
-    chosen = covering(values.places, COVER, seed)
+    chosen = covering_rows(values.places, COVER, seed)
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
     noise = start.noise / values.count[chosen]
-    about, _ = weighed(prior, values.places[chosen], rest[chosen], noise, seed)
+    about, _ = fit_trend_weights(prior, values.places[chosen], rest[chosen], noise, seed)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.of(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
     for own in sets:
-        row = covering(values.places[own], LOOKED_AT // len(sets), seed)
-        parts.append(own[with_nearest(values.places[own], row, LOOKED_BY)])
+        row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
+        parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    sample = Sample.of(every[rows], rest[rows], values.count[rows])
+    sample = NeighbourSample.of(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
     starts = [Kernel.matern((long * share, long), shares, start.noise) for share in SHORTER]

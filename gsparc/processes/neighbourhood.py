@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.ops.transforms import is_differentiated, to_numpy
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 30  # that tell of a place
@@ -22,12 +22,12 @@ ENOUGH = 0.8  # of rows that cover a site, one in each cell
 HALVINGS = 40  # of the side of cells, each a look at all rows
 
 
-def covering(places: np.ndarray, most: int, seed: int) -> np.ndarray:
+def covering_rows(places: np.ndarray, most: int, seed: int) -> np.ndarray:
     """Draw at most so many rows, sorted: one in each of as many cubic cells of one side, the rest at random.
 
     A vehicle that stood for an hour counts no more than a place that it drove by. Time is linear in n.
 
-    >>> covering(np.array([[0.0], [0.1], [0.2], [50.0], [100.0]]), most=3, seed=0).shape
+    >>> covering_rows(np.array([[0.0], [0.1], [0.2], [50.0], [100.0]]), most=3, seed=0).shape
     (3,)
 
     Args:
@@ -80,7 +80,7 @@ class Neighbourhood(Stored):
         """Draw sets of an eighth of the places, of an eighth of these, and so on."""
         rows, sets = np.arange(len(places)), []
         while len(rows) / SPARSER >= FEWEST:
-            rows = rows[covering(places[rows], int(len(rows) / SPARSER), seed)]
+            rows = rows[covering_rows(places[rows], int(len(rows) / SPARSER), seed)]
             sets.append(rows)
         level = np.full(len(places), len(sets), np.int8)
         for number, own in enumerate(sets):
@@ -130,10 +130,10 @@ class Neighbourhood(Stored):
         return np.concatenate(result, 1)
 
 
-def with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOURS) -> np.ndarray:
+def rows_with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOURS) -> np.ndarray:
     """Return rows (T, 1 + most): each of `row` (T,), then its nearest others among places (n, D).
 
-    >>> with_nearest(np.array([[0.0], [3.0], [1.0]]), np.array([0]))
+    >>> rows_with_nearest(np.array([[0.0], [3.0], [1.0]]), np.array([0]))
     array([[0, 2, 1]])
     """
     # A row need not come first among its neighbours, as others may lie at its place.
@@ -146,7 +146,7 @@ def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     distance, row = tree.query(to_numpy(queries))
     if not is_differentiated(queries):
         return torch.from_numpy(distance)
-    return apart(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
+    return distances(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
 
 
 def spacing(places: np.ndarray) -> float:

@@ -12,10 +12,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.processes.conditioned import weighted
+from gsparc.processes.conditioned import weighted_sum
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart
-from gsparc.processes.left_out import left_out
+from gsparc.processes.kernel import distances
+from gsparc.processes.left_out import left_out_residuals
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.prior import Answer, Posterior, Prior
@@ -98,10 +98,10 @@ class Exact(Posterior):
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
-        return apart(queries, self.rows).amin(1)
+        return distances(queries, self.rows).amin(1)
 
     def _mean(self, queries: Tensor, cross: Tensor) -> Tensor:
-        result = weighted(cross, self.weights)
+        result = weighted_sum(cross, self.weights)
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def cross(self, queries: Tensor, own: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ class Exact(Posterior):
     def values(self) -> Tensor:
         """Return the values that it was given (n, P)."""
         lower = self.factor.lower
-        return self.prior.mean(self.rows) + weighted(lower, weighted(lower.T, self.weights))
+        return self.prior.mean(self.rows) + weighted_sum(lower, weighted_sum(lower.T, self.weights))
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
@@ -125,7 +125,7 @@ class Exact(Posterior):
 
     def residual(self) -> tuple[Tensor, Tensor]:
         """Return what all other rows miss of each (n, P), and its variance (n,)."""
-        return left_out(self.factor.precision, self.weights)
+        return left_out_residuals(self.factor.precision, self.weights)
 
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
     return Factor.of(gram, "raise")
 
 
-def approximated(name: str, posterior: Posterior | None) -> str:
+def approximation_label(name: str, posterior: Posterior | None) -> str:
     """Return a method's name with how its process is approximated, where it is."""
     how = None if posterior is None else posterior.approximation
     return name if how is None else f"{name} ({how})"

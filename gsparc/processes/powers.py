@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.processes.averages import mixture
-from gsparc.processes.censored import CERTAIN, ConditionalGaussian, propagate
+from gsparc.processes.averages import mixture_moments
+from gsparc.processes.censored import CERTAIN, ConditionalGaussian, expectation_propagation
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import Nearest, Values, given
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
 from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
@@ -29,10 +29,10 @@ REACH = 0.25  # diagonals of the known places, by which a law's confidence falls
 
 
 @dataclass(frozen=True)
-class Rows:
+class PowerRows:
     """Powers and where they were measured.
 
-    >>> rows = Rows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
+    >>> rows = PowerRows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
     >>> rows.silent, len(rows.loud.decibels)  # the second lies below its level
     (array([False,  True, False]), 2)
 
@@ -60,15 +60,30 @@ class Rows:
         """Those that were measured."""
         return self.at(np.flatnonzero(~self.silent))
 
+    @property
+    def heard(self) -> Self:
+        """Those that were measured, or all where none was."""
+        return self if self.silent.all() else self.loud
+
+    def means_at_places(self) -> PlaceValues:
+        """Return means (m, 1) [dB] over the rows of each place."""
+        return PlaceValues.of(self.places, torch.from_numpy(self.decibels)[:, None])
+
+    def regression_about(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
+        places = torch.from_numpy(self.places)
+        rest = torch.from_numpy(self.decibels) - trend.mean(places)
+        return distances(places, places), trend.columns(places), rest[:, None]
+
     def drawn(self, most: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.at(draw(self.silent, most, seed))
+        return self.at(draw_rows(self.silent, most, seed))
 
 
-def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
+def draw_rows(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
     """Draw at most so many rows, sorted; at least half of them were heard where as many were.
 
-    >>> len(draw(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
+    >>> len(draw_rows(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
     8
     """
     rng = np.random.default_rng(seed)
@@ -80,11 +95,11 @@ def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
     return np.sort(np.concatenate([loud, quiet]))
 
 
-def trend_of_rows(rows: Rows, law: Law | None) -> Trend:
+def trend_about_rows(rows: PowerRows, law: Law | None) -> Trend:
     """Return a trend about a law; about the mean of what was heard where that is None."""
     if law is not None:
         return Trend.about(law, torch.from_numpy(rows.places))
-    return Trend(float((rows if rows.silent.all() else rows.loud).decibels.mean()))
+    return Trend(float(rows.heard.decibels.mean()))
 
 
 @dataclass(frozen=True)
@@ -115,8 +130,7 @@ class PowerProcess(Stored):
     @property
     def trend(self) -> Trend:
         """Trend of the prior."""
-        assert self.posterior.prior.trend is not None
-        return self.posterior.prior.trend
+        return self.posterior.prior.known_trend
 
     @property
     def places(self) -> np.ndarray:
@@ -131,7 +145,7 @@ class PowerProcess(Stored):
         """
         if self.others:
             parts = [(share, *one.answer(queries)) for share, one in self.members]
-            mean, variance = mixture([part[:3] for part in parts])
+            mean, variance = mixture_moments([part[:3] for part in parts])
             return mean, variance, sum((part[0] * part[3] for part in parts), torch.zeros_like(mean))
         result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
@@ -165,22 +179,22 @@ class PowerProcess(Stored):
             exact = one.posterior if isinstance(one.posterior, Exact) else None
             heard = torch.from_numpy(at) if exact is None else exact.extra == 0
             parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
-        return mixture(parts)
+        return mixture_moments(parts)
 
     def exact(self) -> PowerProcess:
         """Return the first alone, with covariances between places; of many rows, given some of them."""
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
             return replace(self, others=())
-        few = covering(self.places, MOST_ROWS, 0)
+        few = covering_rows(self.places, MOST_ROWS, 0)
         places, prior = torch.from_numpy(self.places[few]), nearest.prior
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
         return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
 
 
-def conditioned(
-    rows: Rows, prior: Prior, seed: int, least: int = LEAST_SILENT
+def condition_on_powers(
+    rows: PowerRows, prior: Prior, seed: int, least: int = LEAST_SILENT
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return the process given all rows, and what must be said of the silent ones.
 
@@ -193,29 +207,29 @@ def conditioned(
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
         return _exact(rows.drawn(MOST_ROWS, seed), prior, least)
     loud = rows.loud
-    values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
+    values = loud.means_at_places()
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
     heard = float((share * (values.values[:, 0] - middle).square()).sum()) / prior.kernel.amplitude
     note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
-        return PowerProcess(given(prior, values, seed), heard), (note,)
+        return PowerProcess(condition_on_nearest(prior, values, seed), heard), (note,)
     part = rows.drawn(MOST_ROWS, seed)
     few, notes = _exact(part, prior, least)
     posterior = few.posterior
     assert isinstance(posterior, Exact)
     quiet = posterior.extra > 0
-    stand_ins = Values(
+    stand_ins = PlaceValues(
         posterior.rows[quiet].numpy(),
         posterior.values()[quiet],
         torch.ones(int(quiet.sum()), dtype=torch.float64),
     )
     of = f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are looked at"
-    nearest = given(prior, values, seed, stand_ins, posterior.extra[quiet])
+    nearest = condition_on_nearest(prior, values, seed, stand_ins, posterior.extra[quiet])
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
-def _exact(rows: Rows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def _exact(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
     counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
     notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
     places, decibels, extra, factor = _with_pseudo_values(rows, prior, least, notes)
@@ -226,7 +240,7 @@ def _exact(rows: Rows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[st
 
 
 def _with_pseudo_values(
-    rows: Rows, prior: Prior, least: int, notes: list[str]
+    rows: PowerRows, prior: Prior, least: int, notes: list[str]
 ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
     """Places, decibels, extra variances and a factor; pseudo-values of the silent rows that say anything."""
     places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
@@ -249,7 +263,7 @@ def _with_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = propagate(known.at(near), level[near], side[near])
+        sites = expectation_propagation(known.at(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:

@@ -27,6 +27,12 @@ class Prior(Stored):
     kernel: Kernel
     trend: Trend | None = None
 
+    @property
+    def known_trend(self) -> Trend:
+        """The trend, where there is one."""
+        assert self.trend is not None
+        return self.trend
+
     def mean(self, places: Tensor) -> Tensor:
         """Return the mean (n, 1) at places (n, D) [m]."""
         return places.new_zeros(len(places), 1) if self.trend is None else self.trend.mean(places)[:, None]

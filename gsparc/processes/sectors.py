@@ -7,16 +7,17 @@ TR 36.814, table A.2.1.1-2:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import apart
-from gsparc.processes.stored import Stored
+from gsparc.processes.kernel import ExponentialShadowing, distances, to_number
+from gsparc.processes.places import Places, moving_end, on_floor, other_end
+from gsparc.processes.term import Term
 from gsparc.processes.trend import Trend
 
 ELEVATION_FLOOR_DB = 20.0
@@ -27,12 +28,18 @@ SHARED_SPREAD = torch.tensor((0.7, 2.0, 0.2, 0.3, 4.0, 1.5), dtype=torch.float64
 # Of a sector's own: azimuth, tilt [deg], logarithm of its width, floor [dB]; slope [dB a decade].
 OWN_SPREAD = torch.tensor((5.0, 1.0, 0.1, 2.5, 3.0), dtype=torch.float64)
 LEVEL_DB = 4.0  # of a band
+SHARE_SPAN = (1e-2, 1e3)  # bounds of a part's variance [dB^2]
 NONE = torch.zeros(0, dtype=torch.float64)
 NO_AZIMUTH = -1.0
 ROUND = torch.tensor([[NO_AZIMUTH, 0.0, 65.0, 10.0, 0.0]])  # without a pattern, of mean power
 STEP = 0.5  # of a spread, for slopes of the mean
 UNITS = STEP * torch.cat([SHARED_SPREAD, OWN_SPREAD[:4]]).diag()
 STEPS = torch.cat([UNITS, -UNITS, 0 * UNITS[:1]])  # of parameters, the last without any
+
+
+def sector_of(places: Places) -> Places:
+    """Return the number of the station (..., n) that places (..., n, 7) are of."""
+    return places[..., 6]
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,7 @@ class Sectors(Trend):
     ) -> Tensor:
         """Return powers (..., n) [dB] for shared parameters (..., 6), levels; a sector's own (..., 4)."""
         assert self.law is not None
-        number = places[:, 6].long()
+        number = sector_of(places).long()
         decades = self.law.decades(places) - self.middle
         exponent, bend = shared.unsqueeze(-1).unbind(-2)[:2]
         level = levels[self.band[number]] + self.table[number, 4] - 10 * exponent * decades
@@ -88,11 +95,11 @@ class Sectors(Trend):
 
     def loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
         """Return what patterns take off (..., n) [dB]; see `at`."""
-        azimuth, tilt, width, height, _ = self.table[places[:, 6].long()].T
+        azimuth, tilt, width, height, _ = self.table[sector_of(places).long()].T
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
-        away = places[:, :3] - places[:, 3:6]
-        flat = away[:, :2].norm(dim=1).clamp_min(1e-3)
+        away = moving_end(places) - other_end(places)
+        flat = on_floor(away).norm(dim=1).clamp_min(1e-3)
         # From north and clockwise, as azimuths of sectors are given.
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
         down = torch.rad2deg(torch.atan2(-away[:, 2], flat))
@@ -117,7 +124,7 @@ class Sectors(Trend):
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         slopes = self.slopes(places)[1] if slopes is None else slopes
-        bands = self.which[1][places[:, 6].long()]
+        bands = self.which[1][sector_of(places).long()]
         return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
     def columns(self, places: Tensor) -> Tensor:
@@ -130,53 +137,47 @@ class Sectors(Trend):
         (mean, slopes), decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        own = (self.which[0][places[:, 6].long(), :, None] * parts[:, None]).flatten(1)
+        own = (self.which[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
         return mean, torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 
 @dataclass(frozen=True)
-class SectorKernel(Stored):
-    """`amplitude (a exp(site) + same sector (b exp(own) + c bearing + d) + noise)` of one site's sectors.
+class SectorShadowing(Term[Tensor]):
+    """`a exp(site) + same sector (b exp(own) + c bearing + d)` of one site's sectors.
 
     Shadowing decays exponentially over distance (M. Gudmundson, Electronics Letters 27 (1991); 3GPP TR
     38.901, section 7.4.4).
 
     Attributes:
         lengths: of a site's shadowing and of a sector's own [m].
-        shares: a, b, c and d, of a sector's level; they sum to 1.
-        noise: variance relative to `amplitude`.
-        amplitude: variance of a value [dB^2].
+        shares: a, b, c and d, of a sector's level; in a kernel they sum to 1.
     """
 
-    lengths: Sequence[Tensor | float]
-    shares: Sequence[Tensor | float]
-    noise: Tensor | float
-    amplitude: Tensor | float = 1.0
+    lengths: tuple[Tensor | float, ...]
+    shares: tuple[Tensor | float, ...]
 
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (..., n, m) of places (..., n, 7) and (..., m, 7)."""
-        distance = apart(a[..., :3], b[..., :3])
-        towards = [torch.nn.functional.normalize(at[..., :2] - at[..., 3:5], dim=-1) for at in (a, b)]
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return that (..., n, m) of places (..., n, 7) and (..., m, 7), see `Term`."""
+        distance = distances(moving_end(a), moving_end(b))
+        ways = (on_floor(moving_end(at) - other_end(at)) for at in (a, b))
+        towards = [torch.nn.functional.normalize(way, dim=-1) for way in ways]
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = (towards[0] / BEARING**2 @ towards[1].mT - 1 / BEARING**2).exp()
         (site, sector, bearing, level), (wide, near) = self.shares, self.lengths
         own = sector * (distance * (-1 / near)).exp() + bearing * alike + level
-        return site * (distance * (-1 / wide)).exp() + (a[..., 6:] == b[..., 6:].mT) * own
+        same = sector_of(a)[..., :, None] == sector_of(b)[..., None, :]
+        return site * (distance * (-1 / wide)).exp() + same * own
 
-    @classmethod
-    def of(cls, parameters: Tensor) -> Self:
-        """Return the kernel of logarithms (7,): lengths, variances of its parts, of the noise [dB^2]."""
-        *lengths, site, sector, bearing, level, noise = parameters.exp().unbind()
-        amplitude = site + sector + bearing + level
-        shares = [part / amplitude for part in (site, sector, bearing, level)]
-        return cls(lengths, shares, noise / amplitude, amplitude)
+    def parameters(self) -> Tensor:
+        """Return logarithms of lengths and shares (6,)."""
+        return torch.tensor([*self.lengths, *self.shares], dtype=torch.float64).log()
 
-    def state(self) -> dict[str, Any]:
-        """Return numbers that `read` needs."""
-        return {"site_kernel": [*self.lengths, *self.shares, self.noise, self.amplitude]}
+    def bounds(self, scale: float) -> list[tuple[float, float]]:
+        """See `Term`."""
+        lengths = ExponentialShadowing(scale).bounds(scale) * len(self.lengths)
+        return lengths + [(math.log(SHARE_SPAN[0]), math.log(SHARE_SPAN[1]))] * len(self.shares)
 
-    @classmethod
-    def read(cls, state: Mapping[str, Any]) -> Self:
-        """Return the kernel whose `state()` this was."""
-        v = tuple(float(value) for value in state["site_kernel"])
-        return cls(v[:2], v[2:6], v[6], v[7])
+    def at(self, parameters: Tensor) -> Self:
+        """See `Term`."""
+        lengths, shares = parameters.exp().split((len(self.lengths), len(self.shares)))
+        return replace(self, lengths=tuple(map(to_number, lengths)), shares=tuple(map(to_number, shares)))

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from gsparc.processes.factor import Factor, whitened_rounded
-from gsparc.processes.left_out import left_out
+from gsparc.processes.left_out import left_out_residuals
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
@@ -40,13 +40,13 @@ class Block:
     @classmethod
     def of(cls, process: Exact, columns: Tensor) -> Block:
         """Whiten a process with shared columns (n, P), in units of the values, at its rows."""
-        deviation = deviation_of(process.prior)
+        deviation = process_deviation(process.prior)
         # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whitened(columns) / deviation, values)
 
 
-class Shared:
+class SharedTermsPosterior:
     """What the rows of several processes say of shared terms, and so of each other.
 
     Args:
@@ -67,7 +67,7 @@ class Shared:
         self._alike = len({one.prior.kernel for one in processes.values()}) == 1
         self._blocks: dict[int, Block] = {}
         self._stacks: dict[tuple[tuple[int, ...], torch.dtype], tuple[Tensor, ...]] = {}
-        self.factor, self.mean = weights or weights_of([self.block(number) for number in processes])
+        self.factor, self.mean = weights or shared_weights([self.block(number) for number in processes])
 
     def block(self, number: int) -> Block:
         """Return the block of one process, factored when it is asked for."""
@@ -142,7 +142,7 @@ class Shared:
             rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
             places, terms, weights = self._stack(asked, torch.float32 if rounded else torch.float64)
             near = prior.kernel.between(queries.to(places), places)
-            cross = deviation_of(prior) * near.baddbmm(own.to(places), terms.mT)
+            cross = process_deviation(prior) * near.baddbmm(own.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
             blocks = [self.block(one) for one in asked]
             factors = [block.process.factor for block in blocks]
@@ -176,19 +176,19 @@ class Shared:
     def left_out(self, number: int) -> tuple[Tensor, Tensor]:
         """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
         block = self.block(number)
-        root = block.process.factor.root / deviation_of(block.process.prior)
+        root = block.process.factor.root / process_deviation(block.process.prior)
         # Diagonal of `L^-T (1 - V C V^T) L^-1`, C the covariance of the weights (Woodbury).
         known = self.factor.whitened((root.T @ block.columns).T).square().sum(0)
         rest = block.values - block.columns @ self.mean
-        return left_out(root.square().sum(0) - known, root.T @ rest)
+        return left_out_residuals(root.square().sum(0) - known, root.T @ rest)
 
 
-def deviation_of(prior: Prior) -> float:
+def process_deviation(prior: Prior) -> float:
     """Return the deviation of a process [units of its values]."""
     return math.sqrt(prior.kernel.amplitude)
 
 
-def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
+def shared_weights(blocks: list[Block]) -> tuple[Factor, Tensor]:
     """Return the factor of the precision (P, P) of the shared weights, and their mean (P,)."""
     size = blocks[0].columns.shape[1]
     # From the identity, the precision of unit normal weights before any row.
@@ -199,16 +199,16 @@ def weights_of(blocks: list[Block]) -> tuple[Factor, Tensor]:
     return factor, factor.solved(right[:, None])[:, 0]
 
 
-def left_out_whole(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
+def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
     """Return errors (n,) of each process's rows predicted from the other processes, and variances.
 
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
     """
-    factor, mean = weights_of(blocks)
+    factor, mean = shared_weights(blocks)
     result = []
     for block in blocks:
         known = factor.whitened(block.columns.T)
-        lower = block.process.factor.lower * deviation_of(block.process.prior)
+        lower = block.process.factor.lower * process_deviation(block.process.prior)
         inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solved((block.values - block.columns @ mean)[:, None])[:, 0]
         result.append((lower @ error, inner.whitened(lower.T).square().sum(0)))

@@ -14,7 +14,7 @@ PLUGINS = "gsparc.terms"  # entry points of installed kinds
 KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
 
 
-def name_of(kind: type) -> str:
+def kind_name(kind: type) -> str:
     """Return the name that a class is stored by: with its module where that is not ours."""
     ours = kind.__module__.startswith("gsparc.")
     return kind.__name__ if ours else f"{kind.__module__}.{kind.__qualname__}"
@@ -28,7 +28,7 @@ class Stored:
 
     def __init_subclass__(cls, **rest: Any) -> None:
         super().__init_subclass__(**rest)
-        KINDS[name_of(cls)] = cls
+        KINDS[kind_name(cls)] = cls
 
     def state(self) -> dict[str, Any]:
         """Return what `read` needs: the fields of a dataclass, else all attributes."""
@@ -48,7 +48,7 @@ def stored(part: Any) -> Any:
     [1.0, None, {'array': tensor([0., 0.], dtype=torch.float64)}]
     """
     if isinstance(part, Stored):
-        return {"kind": name_of(type(part)), "state": part.state()}
+        return {"kind": kind_name(type(part)), "state": part.state()}
     if isinstance(part, np.ndarray):
         return {"array": torch.from_numpy(part)}
     return [stored(each) for each in part] if isinstance(part, (tuple, list)) else part

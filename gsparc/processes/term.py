@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Generic, Self, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,13 +19,15 @@ class Term(Stored, ABC, Generic[Rows]):
     Numbers of a term may be floats, or tensors with gradients where they are being learned.
     """
 
+    by_distance: ClassVar[bool] = False  # whether distances of rows are all that counts, also of both ends
+
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:
         """Return the covariance (n, m) of values at rows `a` (n) and `b` (m), real or complex."""
 
-    @abstractmethod
     def variance(self, a: Rows) -> Tensor:
-        """Return the variance (n,) of values at rows `a`, the diagonal of `covariance(a, a)`."""
+        """Return the variance (n,) of values at rows `a`."""
+        return self.covariance(a, a).diagonal().real
 
     def parameters(self) -> Tensor:
         """Return what is learned of it (p,) float64, unbounded: logarithms of powers and lengths."""

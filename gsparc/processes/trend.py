@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.processes.places import moving_end, other_end
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Columns
 
@@ -41,12 +42,18 @@ class Law(Stored):
     scale: float
     place: tuple[float, float, float] | None
 
+    def _squared(self, places: Tensor) -> Tensor:
+        still = other_end(places) if self.place is None else places.new_tensor(self.place)
+        return (moving_end(places) - still).square().sum(1).clamp_min(max(self.floor, TINY_M) ** 2)
+
+    def distance(self, places: Tensor) -> Tensor:
+        """Return the distance [m], floored, (n,) at (n, 3), or of both ends (n, 6) [m]."""
+        return self._squared(places).sqrt()
+
     def decades(self, places: Tensor) -> Tensor:
-        """Return log10 of the distance in metres, floored, (n,) at (n, 3), or of both ends (n, 6) [m]."""
-        still = places[:, 3:6] if self.place is None else places.new_tensor(self.place)
-        squared = (places[:, :3] - still).square().sum(1)
+        """Return log10 of `distance` in metres (n,)."""
         # Half the logarithm of the square: the root, whose slope at 0 is infinite, is never taken.
-        return 0.5 * torch.log10(squared.clamp_min(max(self.floor, TINY_M) ** 2))
+        return 0.5 * torch.log10(self._squared(places))
 
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""
@@ -78,10 +85,10 @@ class Walls(Columns):
 
     def columns(self, places: Tensor) -> Tensor:
         """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6) [m]."""
-        other = self.still.expand(len(places), 3) if len(self.still) else places[:, 3:]
+        other = self.still.expand(len(places), -1) if len(self.still) else other_end(places)
         start, end = (
             (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
-            for at in (places[:, :3], other)
+            for at in (moving_end(places), other)
         )
         apart = (start - end)[..., :1]
         # Where a path meets the wall's plane; a path along the plane is divided by 1, and never counts.

@@ -11,9 +11,9 @@ import math
 import numpy as np
 import torch
 
-from gsparc.processes.density import Profiled, gram_of, learned
-from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.neighbourhood import covering
+from gsparc.processes.density import Profiled, covariance_of, fit_kernel
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.neighbourhood import covering_rows
 
 SHORT, LONG = (0.25, 1.0), (1.0, 300.0)  # wavelengths; next to no field varies within a quarter
 START = (0.37, 2.8)
@@ -24,28 +24,28 @@ LEARNED_ON = 400  # rows
 LOOKS, SETTLED = 8, 1e-4
 
 
-def first_kernel(length: float, spacing: float = 0.0) -> Kernel:
+def initial_kernel(length: float, spacing: float = 0.0) -> Kernel:
     """Return the kernel before anything was learned.
 
     `length` is a wavelength, or what stands for it; `spacing` between places, which the longer one spans [m].
 
-    >>> [round(length, 3) for length in first_kernel(0.1).lengths]
+    >>> [round(length, 3) for length in initial_kernel(0.1).lengths]
     [0.037, 0.28]
     """
     lengths = START[0] * length, max(START[1] * length, SPANS * spacing)
     return Kernel.matern(lengths, (0.5, 0.5), 0.01)
 
 
-def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
+def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
     """Return the kernel of largest evidence near `start`.
 
     Args:
         places: (n, D) [m].
         values: (n, P) complex.
-        length: see `first_kernel`.
+        length: see `initial_kernel`.
         start: where to begin.
     """
-    rows = covering(places, LEARNED_ON, 0)
+    rows = covering_rows(places, LEARNED_ON, 0)
     at = torch.from_numpy(places[rows])
     # Parts of a circular value are independent and alike: twice as many outputs.
     real = torch.from_numpy(np.concatenate([values[rows].real, values[rows].imag], 1)).double()
@@ -53,6 +53,6 @@ def two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Ke
         *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
         (-LOGIT, LOGIT), (math.log(NOISES[0]), math.log(NOISES[1])),
     ]  # fmt: skip
-    distance = apart(at, at)
-    evidence = lambda kernel: Profiled.apply(gram_of(kernel, distance), real)  # noqa: E731
-    return learned(evidence, [start], bounds, LOOKS, SETTLED)[1]
+    distance = distances(at, at)
+    evidence = lambda kernel: Profiled.apply(covariance_of(kernel, distance), real)  # noqa: E731
+    return fit_kernel(evidence, [start], bounds, LOOKS, SETTLED)[1]

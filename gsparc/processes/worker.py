@@ -38,25 +38,25 @@ def raise_if_cancelled() -> None:
         raise Cancelled
 
 
-def late_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Make `late` say, within, what `over`, or who surrounds it, says, in this thread.
+def ending_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Make `out_of_time` say, within, what `over`, or who surrounds it, says, in this thread.
 
-    >>> with late_when(lambda: True):
-    ...     late()
+    >>> with ending_when(lambda: True):
+    ...     out_of_time()
     True
-    >>> late()
+    >>> out_of_time()
     False
     """
     return _within("over", over)
 
 
-def after(most: int) -> Callable[[], bool]:
+def after_steps(most: int) -> Callable[[], bool]:
     """Return a call: whether this thread has made `most` further factors and blocks of candidates."""
     end = getattr(_asked, "steps", 0) + most
     return lambda: getattr(_asked, "steps", 0) >= end
 
 
-def late() -> bool:
+def out_of_time() -> bool:
     """Tell whether this thread's time is over: a loop of more than a second then ends with what it has."""
     over = getattr(_asked, "over", None)
     return over is not None and over()
@@ -64,5 +64,5 @@ def late() -> bool:
 
 def stop_when_late(*unused: object) -> None:
     """Return the callback of `scipy.optimize.minimize`: no step follows when it is late."""
-    if late():
+    if out_of_time():
         raise StopIteration

@@ -12,10 +12,10 @@ from scipy.spatial.distance import cdist
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.powers.settings import fit_powers
+from gsparc.models.powers.settings import fit_power_process
 from gsparc.models.registry import build
 from gsparc.models.target_rows import heard_rows, unheard_note
-from gsparc.processes.powers import Rows
+from gsparc.processes.powers import PowerRows
 from gsparc.training.context import FitContext
 
 STATION = np.array([500.0, 500.0, 20.0])
@@ -145,7 +145,7 @@ def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
     data, _, _ = town(40)
     level = float(10 * np.log10(data.target.max()))
     quiet = np.arange(40) > 0
-    rows = Rows(data.moving, np.where(quiet, level - 20, level), quiet)
-    process, _ = fit_powers(rows, data.site)
+    rows = PowerRows(data.moving, np.where(quiet, level - 20, level), quiet)
+    process, _ = fit_power_process(rows, data.site)
     assert process.kernel.amplitude < 1001
     assert process.answer(torch.from_numpy(data.moving))[0].min() > level - 100

@@ -7,9 +7,9 @@ from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.ops.queries import array_spectrum, has_query_kernel, nearest_weights
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.features import correlation, parts_of
-from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
-from gsparc.processes.nearest import JITTER, weights_of
+from gsparc.processes.features import correlation, matern_parts
+from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, WhiteNoise
+from gsparc.processes.nearest import JITTER, neighbour_weights
 
 
 @pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
@@ -33,7 +33,7 @@ def test_spectra_of_an_array(grid, height, name):
     for rows in (slice(None), slice(2, 3)):
         image, unknown = array_spectrum(
             places[rows], (anchors, whitening), (weights, offset), renderer.tables, renderer.square,
-            parts_of(0.4, name),
+            matern_parts(0.4, name),
         )  # fmt: skip
         torch.testing.assert_close(image, expected[rows], atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(unknown, share[rows], atol=2e-6, rtol=0)
@@ -42,7 +42,7 @@ def test_spectra_of_an_array(grid, height, name):
 @pytest.mark.parametrize("near", [1, 5, 64])
 @pytest.mark.parametrize("kernel", [
     Kernel.of_one(0.3, 0.1), Kernel.matern((0.05, 2.0), (0.3, 0.7), 0.01),
-    Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7)), 0.01),
+    Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7), WhiteNoise(0.01))),
 ])  # fmt: skip
 def test_weights_of_the_nearest_rows(near, kernel):
     torch.manual_seed(1)
@@ -50,7 +50,7 @@ def test_weights_of_the_nearest_rows(near, kernel):
     queries[0] = places[3]
     noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
     rows = torch.cdist(queries, places).topk(near, largest=False).indices
-    expected = weights_of(kernel, queries, places[rows], noise[rows])
+    expected = neighbour_weights(kernel, queries, places[rows], noise[rows])
     found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled, kernel.shares)
     assert found is not None
     for one, other in zip(found, expected, strict=True):

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from gsparc.prediction.confidence import process_variance
-from gsparc.processes.averages import mixture
+from gsparc.processes.averages import mixture_moments
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import EXCESS, Sample, density_given_nearest
+from gsparc.processes.nearest import EXCESS, NeighbourSample, density_given_nearest
 
 KERNEL = Kernel.matern((1.2, 6.0), (0.4, 0.6), 0.08)
 
@@ -34,7 +34,7 @@ def test_density_of_rows_given_their_neighbours():
     amplitude = np.mean(np.divide(squared, variance))
     excess = max(np.log(amplitude / np.mean(values[:, 0] ** 2)), 0)
     wanted = 0.5 * (np.log(amplitude) + np.mean(np.log(variance))) + EXCESS * excess**2 / 12
-    sample = Sample.of(*map(torch.from_numpy, (places, values, count)))
+    sample = NeighbourSample.of(*map(torch.from_numpy, (places, values, count)))
     parameters = KERNEL.parameters().requires_grad_()
     nats, found = density_given_nearest(KERNEL.at(parameters), sample)
     assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6
@@ -45,6 +45,6 @@ def test_variance_of_a_mixture_has_what_its_members_disagree_about():
     rng = np.random.default_rng(2)
     share, mean, variance = np.array([0.2, 0.5, 0.3]), rng.normal(size=(3, 4)), rng.uniform(1, 2, (3, 4))
     parts = list(zip(share, torch.from_numpy(mean), torch.from_numpy(variance), strict=True))
-    found = mixture(parts)
+    found = mixture_moments(parts)
     np.testing.assert_allclose(found[0], share @ mean)
     np.testing.assert_allclose(found[1], share @ (variance + mean**2) - (share @ mean) ** 2)

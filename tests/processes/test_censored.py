@@ -8,20 +8,29 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gsparc.processes import censored
-from gsparc.processes.censored import CERTAIN, ConditionalGaussian, log_evidence, propagate, truncated
-from gsparc.processes.powers import draw
+from gsparc.processes.censored import (
+    CERTAIN,
+    ConditionalGaussian,
+    expectation_propagation,
+    log_evidence,
+    truncated_normal_moments,
+)
+from gsparc.processes.powers import draw_rows
 
 
 def test_moments_of_a_truncated_normal():
     z = torch.tensor([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0], dtype=torch.float64)
-    ratio, lost = truncated(z)
+    ratio, lost = truncated_normal_moments(z)
     for one, mean, share in zip(z.tolist(), ratio.tolist(), lost.tolist(), strict=True):
         with mpmath.workdps(60):
             exact = mpmath.npdf(one) / mpmath.ncdf(one)
             kept = 1 - exact * (exact + one)
         assert mean == pytest.approx(float(exact), rel=1e-7)
         assert 1 - share == pytest.approx(float(kept), rel=1e-5)
-    assert all(part.isfinite().all() for part in truncated(torch.tensor([-1e8, 1e8], dtype=torch.float64)))
+    assert all(
+        part.isfinite().all()
+        for part in truncated_normal_moments(torch.tensor([-1e8, 1e8], dtype=torch.float64))
+    )
 
 
 def small_vector(count: int = 8):
@@ -36,7 +45,7 @@ def small_vector(count: int = 8):
 def test_evidence_and_means_are_those_of_sampling(side):
     gram, values, unknown = small_vector()
     told, sides = ConditionalGaussian.of(gram, values, unknown), torch.tensor(side, dtype=torch.int8)
-    sites = propagate(told, values[unknown], sides)
+    sites = expectation_propagation(told, values[unknown], sides)
     normal = multivariate_normal(told.mean, told.covariance, seed=1)
     assert sites.settled
     drawn = normal.rvs(400_000)
@@ -79,14 +88,14 @@ def test_rows_certain_to_be_silent_change_nothing():
     told = ConditionalGaussian.of(gram, values, unknown)
     kept = told.doubt(level) < CERTAIN
     assert kept.tolist() == [True, False, True]
-    every, rest = propagate(told, level), propagate(told.at(kept), level[kept])
+    every, rest = expectation_propagation(told, level), expectation_propagation(told.at(kept), level[kept])
     assert np.allclose(every.value[kept], rest.value, atol=1e-2)
     assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
 
 
 def test_drawn_rows_keep_half_of_what_was_heard():
     silent = np.arange(1000) >= 100
-    rows = draw(silent, 150, 0)
+    rows = draw_rows(silent, 150, 0)
     assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
-    assert (~silent[draw(silent, 300, 0)]).sum() == 100
-    assert np.array_equal(draw(silent, 1000, 0), np.arange(1000))
+    assert (~silent[draw_rows(silent, 300, 0)]).sum() == 100
+    assert np.array_equal(draw_rows(silent, 1000, 0), np.arange(1000))

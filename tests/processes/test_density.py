@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.processes.density import LeftOutDensity, gram_of, walked
+from gsparc.processes.density import LeftOutDensity, covariance_of, minimise
 from gsparc.processes.factor import NotPositiveDefiniteError
 from gsparc.processes.kernel import Kernel
 
@@ -26,7 +26,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
     distance, columns, values = rows(40, outputs)
 
     def density(at: torch.Tensor) -> torch.Tensor:
-        gram = gram_of(kernel.at(at), distance, columns)
+        gram = covariance_of(kernel.at(at), distance, columns)
         return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
 
     at = kernel.parameters().requires_grad_()
@@ -38,7 +38,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
 
 def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
     distance, columns, values = rows(12, 3)
-    gram = gram_of(KERNELS[1], distance, columns)
+    gram = covariance_of(KERNELS[1], distance, columns)
     density, amplitude = (float(part) for part in LeftOutDensity.apply(gram, values, 3, False))
     total, g, y = 0.0, gram.numpy(), values.numpy()
     for i in range(12):
@@ -63,5 +63,5 @@ def test_a_walk_starts_at_the_best_and_goes_round_what_has_no_factor():
             raise NotPositiveDefiniteError
         return (at[0] - 1).square()
 
-    best, value = walked(objective, [np.array([3.0]), np.array([-1.0])], [(-5.0, 5.0)], 40, 1e-9)
+    best, value = minimise(objective, [np.array([3.0]), np.array([-1.0])], [(-5.0, 5.0)], 40, 1e-9)
     assert best[0] == pytest.approx(1.0, abs=1e-3) and value < 1e-6

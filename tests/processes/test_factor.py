@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
-from gsparc.processes.left_out import groups_of, left_out, left_out_signal
+from gsparc.processes.left_out import left_out_residuals, left_out_signal, rows_of_groups
 
 KINDS = {torch.float32: 1e-4, torch.float64: 1e-12, torch.complex64: 1e-4, torch.complex128: 1e-12}
 
@@ -66,8 +66,8 @@ def test_rows_left_out_are_predictions_of_the_rest(kind, grouped):
     given, values = signal + noise, torch.randn(20, 3, dtype=kind)
     inverse = Factor.of(given).inverse
     number = torch.arange(20) // (4 if grouped else 1)
-    groups = groups_of(number.numpy()) if grouped else None
-    residual, variance = left_out(inverse, inverse @ values, groups)
+    groups = rows_of_groups(number.numpy()) if grouped else None
+    residual, variance = left_out_residuals(inverse, inverse @ values, groups)
     missed, spread = left_out_signal(inverse, inverse @ values, noise, groups)
     for one in number.unique():
         own, rest = number == one, number != one

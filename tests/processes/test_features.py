@@ -6,7 +6,7 @@ import torch
 from sklearn.gaussian_process.kernels import Matern
 
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
-from gsparc.processes.features import correlation, pivoted_rows, whitened, with_places
+from gsparc.processes.features import correlation, features_at_places, pivoted_rows, whitened_features
 
 LENGTH, NOISE, NAME = 0.4, 0.01, "smooth_rough"
 
@@ -43,8 +43,8 @@ def test_a_correlation_that_there_is_not_is_refused():
 def test_features_of_all_rows_are_the_posterior():
     known, asked, values = rows(60), rows(20, 1), torch.randn(60, 3, dtype=torch.float64)
     for features in (
-        whitened(known, LENGTH, NOISE, NAME, 60),
-        with_places(known, known, LENGTH, NOISE, NAME),
+        whitened_features(known, LENGTH, NOISE, NAME, 60),
+        features_at_places(known, known, LENGTH, NOISE, NAME),
     ):
         for found, wanted in zip(told(features, values, asked), posterior(known, values, asked), strict=True):
             torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
@@ -54,7 +54,7 @@ def test_places_stand_for_many_rows():
     """600 rows in a small room are told by fewer than 400 of them, about as surely."""
     known, asked = rows(600, extent=0.3), rows(50, 1, extent=0.3)
     values = torch.stack([(3 * known).sin().sum(1), (2 * known).cos().prod(1)], 1)
-    features = whitened(known, LENGTH, NOISE, NAME, 400)
+    features = whitened_features(known, LENGTH, NOISE, NAME, 400)
     assert len(features.places) < 400
     mean, unknown = told(features, values, asked)
     wanted, variance = posterior(known, values, asked)
@@ -67,11 +67,11 @@ def test_there_are_never_more_places_than_allowed_and_never_twins():
     chosen = pivoted_rows(known, LENGTH, 0.0, NAME, 40)
     assert len(set(chosen.tolist())) == 40
     assert len(pivoted_rows(known, LENGTH, 0.0, NAME, 150)) <= 50  # the others are the same places again
-    assert torch.isfinite(whitened(known, LENGTH, NOISE, NAME, 40).whitening).all()
+    assert torch.isfinite(whitened_features(known, LENGTH, NOISE, NAME, 40).whitening).all()
 
 
 def test_the_unknown_share_is_1_far_away_and_small_at_data():
-    features = whitened(rows(60), LENGTH, NOISE, NAME, 60)
+    features = whitened_features(rows(60), LENGTH, NOISE, NAME, 60)
     prior = Prior(features.places.float(), LENGTH, NOISE, NAME, features.whitening.float())
     encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
     assert encode.tells_share and encode.width == 60
@@ -85,7 +85,7 @@ def test_features_far_from_the_middle_are_as_good_as_float64(extent, wavelength)
     """Positions of thousands of wavelengths: differences come before squares, and as positions are stored."""
     known = (rows(40, extent=extent) - extent / 2).float()
     known = torch.cat([known, known + 0.3 * wavelength])
-    features = whitened(known.double(), wavelength / 2, 1e-3, NAME, 80)
+    features = whitened_features(known.double(), wavelength / 2, 1e-3, NAME, 80)
     prior = Prior(known, wavelength / 2, 1e-3, NAME, features.whitening.float())
     encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
     asked = known + 0.1 * wavelength * torch.randn(80, 3)

@@ -15,11 +15,11 @@ from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.reduced import reduce_method
 from gsparc.processes import neighbourhood, powers
 from gsparc.processes.kernel import Kernel, SmoothRough
-from gsparc.processes.nearest import Nearest, Values
-from gsparc.processes.nearest import given as given_places
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering
+from gsparc.processes.nearest import Nearest, PlaceValues
+from gsparc.processes.nearest import condition_on_nearest as given_places
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, Rows, conditioned
+from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
@@ -28,15 +28,15 @@ from tests.models.powers.test_settings import error_db, fit, town
 KERNEL = Kernel.matern((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 
-def rows_of(data, count: int) -> Rows:
-    return Rows(
+def rows_of(data, count: int) -> PowerRows:
+    return PowerRows(
         data.moving[:count], 10 * np.log10(data.target[:count, 0]).astype(float), np.zeros(count, bool)
     )
 
 
-def given(rows: Rows, most: int = NEIGHBOURS) -> PowerProcess:
+def given(rows: PowerRows, most: int = NEIGHBOURS) -> PowerProcess:
     """The same process by nearest rows."""
-    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
+    values = PlaceValues.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
     heard = float(np.average((rows.decibels - rows.decibels.mean()) ** 2)) / KERNEL.amplitude
     return PowerProcess(given_places(Prior(KERNEL, Trend(-100.0)), values, 0, most=most), heard)
 
@@ -51,7 +51,7 @@ def many(monkeypatch):
 def test_given_all_rows_as_neighbours_it_is_the_exact_process():
     data = town(140)
     rows = rows_of(data, 120)
-    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
+    whole, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     near = given(rows, 1000)
     queries = torch.from_numpy(np.concatenate([data.moving[120:], data.moving[120:] + 3000.0]))
     for one, other in zip(near.answer(queries), whole.answer(queries), strict=True):
@@ -70,8 +70,8 @@ def test_rows_of_one_place_are_its_mean_and_lose_nothing():
     data, rng = town(60), np.random.default_rng(0)
     often = np.repeat(np.arange(40), 3)
     rows = rows_of(data, 60).at(often)
-    rows = Rows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
-    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
+    rows = PowerRows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
+    whole, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     near = given(rows, 1000)
     assert len(near.places) == 40
     for one, other in zip(
@@ -96,8 +96,10 @@ def test_silent_rows_stay_known_and_are_counted(many):
     data = town(300)
     level = float(np.quantile(data.target, 0.3))
     silent = data.target[:, 0] < level
-    rows = Rows(data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent)
-    process, notes = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
+    rows = PowerRows(
+        data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent
+    )
+    process, notes = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), notes
     loud = rows.at(np.flatnonzero(~silent))
     deaf = given(loud)
@@ -136,7 +138,7 @@ def test_left_out_is_a_prediction_without_each_place():
     data = town(50)
     rows = rows_of(data, 50)
     near = given(rows, 1000)
-    whole, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
+    whole, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     exactly, spread = (part.numpy() for part in whole.posterior.left_out())
     mean, variance = (part.numpy() for part in near.posterior.left_out())
     # What the terms weigh is known from all rows, the one that is left out among them.
@@ -147,7 +149,7 @@ def test_left_out_is_a_prediction_without_each_place():
 def test_covariances_are_those_of_rows_that_cover_the_site(many):
     data = town(400)
     rows = rows_of(data, 300)
-    process, _ = conditioned(rows, Prior(KERNEL, Trend(-100.0)), 0)
+    process, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     few = process.exact()
     assert len(few.places) == 100 and few.exact() == few and isinstance(few.posterior, Exact)
     queries = torch.from_numpy(data.moving[300:])
@@ -159,11 +161,11 @@ def test_a_parked_car_counts_no_more_than_a_street():
     rng = np.random.default_rng(0)
     parked = 5 + 1e-3 * rng.normal(size=(9000, 2))
     places = np.concatenate([parked, rng.uniform(0, 1000, (1000, 2))])
-    chosen = covering(places, 500, 0)
+    chosen = covering_rows(places, 500, 0)
     assert len(chosen) == 500 and len(np.unique(chosen)) == 500
     assert (chosen >= 9000).mean() > 0.75
-    assert np.array_equal(covering(places[:300], 500, 0), np.arange(300))
-    assert len(covering(np.zeros((50, 3)), 20, 0)) == 20
+    assert np.array_equal(covering_rows(places[:300], 500, 0), np.arange(300))
+    assert len(covering_rows(np.zeros((50, 3)), 20, 0)) == 20
 
 
 def test_kriging_of_many_places_says_how_many(monkeypatch):
@@ -216,7 +218,7 @@ def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
     places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
     prior = Prior(Kernel.of_one(0.5, 0.1, term=SmoothRough))
     queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
-    near = given_places(prior, Values.of(places, values), 0, most=40).answer(queries)
+    near = given_places(prior, PlaceValues.of(places, values), 0, most=40).answer(queries)
     exact = Exact.of(prior, torch.from_numpy(places), values).answer(queries)
     assert torch.allclose(near.mean, exact.mean, atol=1e-6) and torch.allclose(
         near.left, exact.left, atol=1e-6

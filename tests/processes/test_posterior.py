@@ -10,8 +10,8 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing
-from gsparc.processes.nearest import Nearest, Values, given
+from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing, WhiteNoise
+from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Law, Trend
@@ -47,7 +47,9 @@ def test_sums_of_terms_are_gpytorchs(seed):
     places, queries = (3 * torch.rand(n, 2, generator=draw, dtype=torch.float64) for n in (30, 6))
     values = torch.randn(30, generator=draw, dtype=torch.float64)
     terms = Shadowing(short, share), ExponentialShadowing(long, 1 - share)
-    ours = Exact.of(Prior(Kernel(terms, noise, amplitude), Trend(0.0)), places, values[:, None])
+    ours = Exact.of(
+        Prior(Kernel((*terms, WhiteNoise(noise)), amplitude), Trend(0.0)), places, values[:, None]
+    )
 
     parts, kernels = [], gpytorch.kernels
     for kernel, weight in (
@@ -79,14 +81,16 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     generator = torch.Generator().manual_seed(seed)
     places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
-    prior = Prior(Kernel((IsotropicWaves(0.7, 1.0, 20.0),), 0.05))
+    prior = Prior(Kernel((IsotropicWaves(0.7, 1.0, 20.0), WhiteNoise(0.05))))
     both = Exact.of(prior, places, values)
     pairs = Exact.of(prior, places, torch.cat([values.real, values.imag], 1))
     queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
     one, two = both.answer(queries), pairs.answer(queries)
     torch.testing.assert_close(one.mean, torch.complex(*two.mean.split(2, 1)))
     torch.testing.assert_close(one.left, two.left)
-    near = given(prior, Values(places.numpy(), values, torch.ones(30).double()), 0, most=1000)
+    near = condition_on_nearest(
+        prior, PlaceValues(places.numpy(), values, torch.ones(30).double()), 0, most=1000
+    )
     torch.testing.assert_close(near.answer(queries).mean, one.mean, rtol=1e-5, atol=1e-6)
     again = Nearest.read(near.state()).answer(queries)
     torch.testing.assert_close(again.mean, near.answer(queries).mean)

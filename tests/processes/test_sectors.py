@@ -5,7 +5,7 @@ import torch
 from networks import pattern
 from scipy.spatial.distance import cdist
 
-from gsparc.processes.sectors import BEARING, LEVEL_DB, OWN_SPREAD, SHARED_SPREAD, SectorKernel, Sectors
+from gsparc.processes.sectors import BEARING, LEVEL_DB, OWN_SPREAD, SHARED_SPREAD, Sectors, SectorShadowing
 from gsparc.processes.trend import Law
 
 
@@ -19,7 +19,7 @@ def test_rows_of_one_sector_share_shadowing_of_their_own_and_a_bearing():
     own = 0.2 * np.exp(-far / 20.0) + 0.2 * alike + 0.1
     wanted = 0.5 * np.exp(-far / 80.0) + (number == number.T) * own
     at = torch.from_numpy(places)
-    found = SectorKernel((80.0, 20.0), (0.5, 0.2, 0.2, 0.1), 0.1, 9.0).between(at, at)
+    found = SectorShadowing((80.0, 20.0), (0.5, 0.2, 0.2, 0.1)).covariance(at, at)
     np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 

@@ -6,10 +6,10 @@ import pytest
 
 from gsparc.processes.worker import (
     Cancelled,
-    after,
+    after_steps,
     cancelled_by,
-    late,
-    late_when,
+    ending_when,
+    out_of_time,
     raise_if_cancelled,
     stop_when_late,
 )
@@ -30,16 +30,16 @@ def test_it_is_late_after_so_many_steps_of_this_thread_alone():
     seen = []
 
     def work():
-        with late_when(after(2)):
+        with ending_when(after_steps(2)):
             for _ in range(3):
-                seen.append(late())
+                seen.append(out_of_time())
                 raise_if_cancelled()
 
     thread = threading.Thread(target=work)
-    with late_when(lambda: True):
+    with ending_when(lambda: True):
         thread.start()
         thread.join()
-        assert late()
+        assert out_of_time()
         with pytest.raises(StopIteration):
             stop_when_late()
-    assert seen == [False, False, True] and not late()
+    assert seen == [False, False, True] and not out_of_time()

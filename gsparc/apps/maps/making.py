@@ -26,7 +26,7 @@ from gsparc.data.limits import finite_array
 from gsparc.data.links.stations import find_station
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.powers.together.network import sites_of
+from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
@@ -331,5 +331,5 @@ def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
         "station_place": stations.position[numbers, :2] + site.origin[:2],
         "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
         "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),
-        "site": sites_of(stations, stations.position)[numbers],
+        "site": number_sites(stations, stations.position)[numbers],
     }

@@ -31,8 +31,8 @@ from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
-from gsparc.processes.features import whitened
-from gsparc.processes.neighbourhood import covering
+from gsparc.processes.features import whitened_features
+from gsparc.processes.neighbourhood import covering_rows
 from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ def learn_vector_process(
         write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(array, grid, wavelength).numpy()
     partner, places = mirror_elements(array), data.tx[rows]
-    core = covering(places, MOST_ROWS, seed)
+    core = covering_rows(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
     tuned = choose_kernel(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
     kernel = tuned.kernel
@@ -121,7 +121,7 @@ def learn_vector_process(
         others = recovery.vectors[rest], places[rest]
         vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
-    features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
+    features = whitened_features(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
         "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
         kernel.length, kernel.noise, len(features.places), len(rows),

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import weights_of
+from gsparc.processes.nearest import neighbour_weights
 
 SWEEPS = 30
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
@@ -125,7 +125,7 @@ def align_to_nearest(
     near = tree.query(positions, k=np.arange(1, min(NEAREST, len(places)) + 1))[1]
     around = torch.from_numpy(places[near])
     noise = torch.full(near.shape, kernel.noise, dtype=torch.float64)
-    weights, _ = weights_of(kernel, torch.from_numpy(positions), around, noise)
+    weights, _ = neighbour_weights(kernel, torch.from_numpy(positions), around, noise)
     for i, rows in enumerate(near):
         aligned[i] = match_phase_and_twin(aligned[i], weights[i].numpy() @ known[rows], partner)
     return aligned

@@ -23,7 +23,9 @@ from gsparc.data.schema import Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance
-from gsparc.processes.powers import Rows
+from gsparc.physics.decibels import RELATIVE_DB, to_decibels
+from gsparc.processes.places import of_both_ends
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import TINY_M, Law
 from gsparc.processes.worker import stop_when_late
 from gsparc.training.time_budget import TimeBudget
@@ -53,7 +55,7 @@ def law_variance(law: Law) -> float:
     return law.scale**2 * VARIANCE
 
 
-def log_below(z: np.ndarray) -> np.ndarray:
+def log_probability_below(z: np.ndarray) -> np.ndarray:
     """Return the logarithm of the probability that a residual lies below z (n,) scales."""
     tail = np.minimum(z, -CORNER)  # exponential: its logarithm is a line, however far out
     far = CORNER**2 / 2 + CORNER * tail - math.log(CORNER)
@@ -64,7 +66,9 @@ def log_below(z: np.ndarray) -> np.ndarray:
     return np.where(z < -CORNER, far, np.log(near)) - math.log(MASS)
 
 
-def misfit(residual: np.ndarray, side: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
+def likelihood_slopes(
+    residual: np.ndarray, side: np.ndarray, scale: float
+) -> tuple[float, np.ndarray, float]:
     """Return the negative log likelihood of residuals (n,) [dB], its slopes by each (n,) and by log(scale).
 
     Where `side` (n,) is 1 or -1 the residual is of a level that the power lies below or above.
@@ -72,26 +76,30 @@ def misfit(residual: np.ndarray, side: np.ndarray, scale: float) -> tuple[float,
     z = residual / scale
     influence = np.clip(z, -CORNER, CORNER)
     density = influence * (influence / 2 - z) - math.log(MASS)
-    beyond = log_below(np.where(side < 0, -z, z))  # the density is symmetric
+    beyond = log_probability_below(np.where(side < 0, -z, z))  # the density is symmetric
     value = -float(np.where(side, beyond, density - math.log(scale)).sum())
     slope = np.where(side, side * -np.exp(density - beyond), influence)
     return value, slope / scale, float((side == 0).sum() - (slope * z).sum())
 
 
-def _posterior(p: np.ndarray, decades: np.ndarray, rows: Rows) -> tuple[float, list[float], np.ndarray]:
+def _posterior(p: np.ndarray, loss: np.ndarray, rows: PowerRows) -> tuple[float, list[float], np.ndarray]:
     """Negative log posterior of level, exponent and log scale, its slopes by these and by residuals (n,)."""
-    residual = rows.decibels - p[0] + 10 * p[1] * decades
-    value, slope, by_scale = misfit(residual, rows.side, math.exp(p[2]))
-    away = (p[1] - USUAL) / SPREAD
-    slopes = [-slope.sum(), 10 * (slope * decades).sum() + away / SPREAD, by_scale]
+    level, exponent, log_scale = p[:PARAMETERS]
+    residual = rows.decibels - level + exponent * loss
+    value, slope, by_scale = likelihood_slopes(residual, rows.side, math.exp(log_scale))
+    away = (exponent - USUAL) / SPREAD
+    slopes = [-slope.sum(), (slope * loss).sum() + away / SPREAD, by_scale]
     return value + 0.5 * away**2, slopes, slope
 
 
-def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the least negative log posterior, its (level, exponent, log scale), of decades (n,)."""
+def fit_level_and_exponent(loss: np.ndarray, rows: PowerRows, start: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the least negative log posterior, its (level, exponent, log scale).
+
+    `loss` (n,) [dB] is that of exponent 1.
+    """
 
     def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slopes, _ = _posterior(p, decades, rows)
+        value, slopes, _ = _posterior(p, loss, rows)
         return value, np.array(slopes)
 
     bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
@@ -99,16 +107,16 @@ def fit_line(decades: np.ndarray, rows: Rows, start: np.ndarray) -> tuple[float,
     return float(result.fun), result.x
 
 
-def _start(decades: np.ndarray, rows: Rows) -> np.ndarray:
+def _start(loss: np.ndarray, rows: PowerRows) -> np.ndarray:
     """Level and scale by medians for the usual exponent, from what was heard where anything was."""
     used = ~rows.silent if not rows.silent.all() else rows.silent
-    levels = rows.decibels[used] + 10 * USUAL * decades[used]
+    levels = rows.decibels[used] + USUAL * loss[used]
     middle = float(np.median(levels))
     scale = 1.5 * float(np.median(np.abs(levels - middle)))
     return np.array([middle, USUAL, math.log(min(max(scale, 1.0), SPREADS_DB[1] / 2))])
 
 
-def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
+def fit_law(rows: PowerRows, place: np.ndarray | None) -> Law:
     """Return the law of largest likelihood; the floor is chosen by it too.
 
     Args:
@@ -118,13 +126,13 @@ def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
     at = None if place is None else (float(place[0]), float(place[1]), float(place[2]))
     law = Law(0.0, USUAL, 0.0, 1.0, at)
     places = torch.from_numpy(np.ascontiguousarray(rows.places, np.float64))
-    far = 10 ** law.decades(places).numpy()
+    far = law.distance(places).numpy()
     # From the nearest row (no floor) to the median: beyond, half of the rows would tell nothing of n.
     low, high = np.maximum(np.quantile(far, [0.0, 0.5]), TINY_M)
-    start = at_best = _start(np.log10(far), rows)
+    start = at_best = _start(to_decibels(far), rows)
     best = np.inf
     for floor in np.unique(np.geomspace(low, high, FLOORS)):
-        value, result = fit_line(np.log10(np.maximum(far, floor)), rows, start)
+        value, result = fit_level_and_exponent(to_decibels(np.maximum(far, floor)), rows, start)
         if value < best:
             best, at_best, law, start = value, result, replace(law, floor=float(floor)), result
     count = int((~rows.silent).sum())
@@ -133,7 +141,7 @@ def fit_law(rows: Rows, place: np.ndarray | None) -> Law:
     return replace(law, level=level, exponent=exponent, scale=math.exp(scale) * few)
 
 
-def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
+def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     """Return the place (3,) [m] of a still end that explains powers best, from several starts.
 
     Heights above and below the places' own plane fit alike: one of the two is found.
@@ -146,36 +154,35 @@ def seek_place(rows: Rows, seed: int = 0) -> np.ndarray:
     bounds = np.stack([low - size, high + size], 1)
     loud = np.argsort(np.where(rows.side > 0, -np.inf, rows.decibels))[::-1]
     starts = [rows.places[loud[0]], rows.places[loud[: max(1, len(loud) // 20)]].mean(0)]
-    starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, 3)))
+    starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, len(low))))
     tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
 
     def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
-        towards = (p[3:] * size) - rows.places
+        towards = (p[PARAMETERS:] * size) - rows.places
         squared = (towards**2).sum(1) + tiny
-        decades = 0.5 * np.log10(squared)
-        value, slopes, slope = _posterior(p, decades, rows)
-        by_place = 10 * p[1] / math.log(10) * size * (slope / squared) @ towards
+        value, slopes, slope = _posterior(p, to_decibels(squared) / 2, rows)
+        by_place = RELATIVE_DB * p[1] * size * (slope / squared) @ towards
         return value, np.array([*slopes, *by_place])
 
     limits = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB)), *(bounds / size)]
     result = []
     for place in starts:
         place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
-        decades = 0.5 * np.log10(((place - rows.places) ** 2).sum(1) + tiny)
-        start = np.concatenate([_start(decades, rows), place / size])
+        loss = to_decibels(((place - rows.places) ** 2).sum(1) + tiny) / 2
+        start = np.concatenate([_start(loss, rows), place / size])
         result.append(
             minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late)
         )
-    return min(result, key=lambda one: float(one.fun)).x[3:] * size
+    return min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
 
 
-def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
+def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
     """Return the law of powers at a site, and notes: a place that nobody gave is estimated."""
-    if rows.places.shape[1] == 6:
+    if of_both_ends(rows.places):
         return fit_law(rows, None), ()
     if site.static_position is not None and np.isfinite(site.static_position).all():
         return fit_law(rows, site.static_position), ()
-    place = seek_place(rows)
+    place = locate_still_end(rows)
     end = "transmitter" if site.static_end == "tx" else "receiver"
     where = ", ".join(f"{value:.4g}" for value in place + site.origin)
     return fit_law(rows, place), (f"the {end}'s place is not given; estimated from powers at ({where}) m",)
@@ -191,10 +198,10 @@ class DistanceLaw(Differentiable):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
 
-    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
+    def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         assert self.site is not None
         started = TimeBudget()
-        self.law, notes = law_of(rows, self.site)
+        self.law, notes = fit_site_law(rows, self.site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "

@@ -13,25 +13,31 @@ from scipy.linalg import eigh
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from gsparc.data.blocks import blocks
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
-from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_powers
+from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_power_process
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import entry_variance, power_rows, to_real
-from gsparc.processes.density import by_left_out
-from gsparc.processes.kernel import Kernel, apart
-from gsparc.processes.nearest import Sample, Values, given, most_likely_given_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering, with_nearest
-from gsparc.processes.posterior import Exact, Posterior, approximated
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, draw
+from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.nearest import (
+    NeighbourSample,
+    PlaceValues,
+    condition_on_nearest,
+    most_likely_given_nearest,
+)
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
+from gsparc.processes.posterior import Exact, Posterior, approximation_label
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, draw_rows
 from gsparc.processes.prior import Prior
 
-LOOKS = 40  # of a choice of settings
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
 STRONGEST = 32  # components that they are chosen by
+ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
 
 @dataclass(frozen=True)
@@ -69,11 +75,11 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     # n centred rows span n - 1 directions.
     keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
     values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
-    solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
+    solid = values > ROUNDING * max(values[-1], TINY)
     if not solid.any():  # one sample, or all alike
         solid[-1] = True
     values, vectors = values[solid], vectors[:, solid]
-    length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    length = np.sqrt(np.maximum(values, TINY))
     axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
     # A small difference of large sums may round below 0.
@@ -81,7 +87,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
+def choose_kernel_by_left_out(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
     """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
@@ -92,14 +98,15 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
-        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
+        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
     starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    distance = apart(places, places)
-    # The figures move by 1e-4 beyond so many looks.
-    return by_left_out(starts, distance, None, values, bounds, LOOKS, 1e-5, entries, bounded=False)[1]
+    distance = distances(places, places)
+    # The figures move by 1e-4 beyond this.
+    known = starts, distance, None, values, bounds
+    return fit_kernel_by_left_out(*known, tolerance=2 * SETTLED, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):
@@ -137,8 +144,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         looked_at: np.ndarray | slice = slice(None)
         if len(targets) > CHOSEN_ON:
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
-            looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
-        kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+            looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        kernel = choose_kernel_by_left_out(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
@@ -150,28 +157,29 @@ class GaussianProcess(Differentiable, ClosedForm):
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
-        rows = covering(positions, CHOSEN_ON, 0)
+        rows = covering_rows(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
-        start = choose_kernel(positions[rows], parts.scores, len(parts.mean))
-        scores, self.lost = projected(targets, self.kind, parts.mean, parts.axes)
-        kernel, fit_note = kernel_given_nearest(positions, scores, len(parts.mean), start, 0)
+        start = choose_kernel_by_left_out(positions[rows], parts.scores, len(parts.mean))
+        scores, self.lost = project_targets(targets, self.kind, parts.mean, parts.axes)
+        kernel, fit_note = choose_kernel_by_neighbours(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
-        self.scores = given(Prior(kernel), Values(positions, torch.from_numpy(scores), once), 0)
+        values = PlaceValues(positions, torch.from_numpy(scores), once)
+        self.scores = condition_on_nearest(Prior(kernel), values, 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
         scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
         settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
 
-    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
+    def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         assert self.site is not None
-        self.powers, notes = fit_powers(rows, self.site, self.about)
+        self.powers, notes = fit_power_process(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, self.scores if self.powers is None else self.powers.posterior)
+        return approximation_label(self.name, self.scores if self.powers is None else self.powers.posterior)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -182,7 +190,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is None:
             return None
         result = copy.copy(self)
-        result.powers, _ = conditioned(power_rows(data, rows), self.powers.posterior.prior, 0)
+        result.powers, _ = condition_on_powers(power_rows(data, rows), self.powers.posterior.prior, 0)
         return result
 
     def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
@@ -241,22 +249,19 @@ class GaussianProcess(Differentiable, ClosedForm):
         return Interpolated(means, grid, stride) if stride > 1 and grid is not None else means
 
 
-def projected(
-    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray, block: int = 256
+def project_targets(
+    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond them.
-
-    `block` targets are floats at a time.
-    """
+    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
-    for start in range(0, len(targets), block):
-        rows = to_real(targets[start : start + block], kind) - mean
-        scores[start : start + block] = result = rows @ axes.T
+    for part in blocks(targets):
+        rows = to_real(targets[part], kind) - mean
+        scores[part] = result = rows @ axes.T
         beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
 
-def kernel_given_nearest(
+def choose_kernel_by_neighbours(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
     """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
@@ -267,12 +272,13 @@ def kernel_given_nearest(
         start: a kernel of one length, chosen on few rows.
         seed: of rows that are drawn.
     """
-    row = covering(places, LOOKED_AT, seed)
-    rows = with_nearest(places, row)
+    row = covering_rows(places, LOOKED_AT, seed)
+    rows = rows_with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
-    sample = Sample.of(torch.from_numpy(places[rows]), values, torch.ones(rows.shape, dtype=torch.float64))
+    once = torch.ones(rows.shape, dtype=torch.float64)
+    sample = NeighbourSample.of(torch.from_numpy(places[rows]), values, once)
     result = most_likely_given_nearest([start], sample, pdist(places[row]))
-    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), 1e-30)
+    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note

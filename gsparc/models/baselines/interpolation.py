@@ -14,7 +14,7 @@ from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import from_real, heard_rows, power_rows, training_targets, unheard_note
-from gsparc.processes.powers import Rows
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -101,7 +101,7 @@ class Interpolator(Method):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn positions (n, 3) float64 [m] and stored targets (n, ...); return notes for the report."""
 
-    def _learn_powers(self, rows: Rows) -> tuple[str, ...]:
+    def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         """The same of powers, where it learns from rows of which a level is known too (`uses_censored`)."""
         raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 

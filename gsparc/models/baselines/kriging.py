@@ -23,10 +23,11 @@ from scipy.spatial.distance import cdist, pdist
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.stored import Stored
 
-FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
+FLOOR = 1e-3  # of a pixel, of the brightest possible: -30 dB
 SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels
 BINS = 24
 PAIRS = 200_000  # looked at for the variogram
@@ -124,11 +125,11 @@ class Kriging(Interpolator):
         if self.kind == "csi":
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
             floor = max(float(power.mean()) * 1e-8, SILENCE)
-            return 10 * np.log10(np.maximum(power, floor)).astype(np.float32)
+            return to_decibels(np.maximum(power, floor)).astype(np.float32)
         rows = to_real(targets, self.kind)
         if self.kind == "rssi":
             return rows  # already decibels
-        return 10 * np.log10(np.maximum(rows, np.float32(10 ** (FLOOR_DB / 10))))
+        return to_decibels(np.maximum(rows, np.float32(FLOOR)))
 
     def _solve(self) -> None:
         """Factor the system of all places, or prepare to find the nearest of too many for that."""
@@ -192,10 +193,10 @@ class Kriging(Interpolator):
         decibels, variance = weighed(self.values, torch.float32), torch.from_numpy(left).float()
         power = self.kind == "rssi"
         if self.channels is None:
-            mean = self._decode(decibels if power else 10 ** (decibels / 10))
+            mean = self._decode(decibels if power else from_decibels(decibels))
         else:
             towards = weighed(self.channels, torch.complex64)
-            mean = torch.polar(10 ** (decibels / 20), towards.angle()).view(-1, *self.shape)
+            mean = torch.polar(from_decibels(decibels / 2), towards.angle()).view(-1, *self.shape)
         unknown = (variance / self.variogram.total).clamp(0, 1)
         return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from gsparc.data.blocks import blocks
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import to_real
@@ -18,8 +19,8 @@ class Mean(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         total = np.zeros(int(np.prod(self.shape)) * (2 if self.kind == "csi" else 1))
-        for start in range(0, len(targets), 256):  # thousands of byte images never become floats at once
-            total += to_real(targets[start : start + 256], self.kind).sum(0, dtype=np.float64)
+        for part in blocks(targets):  # thousands of byte images never become floats at once
+            total += to_real(targets[part], self.kind).sum(0, dtype=np.float64)
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()
 

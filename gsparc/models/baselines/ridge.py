@@ -16,7 +16,7 @@ from gsparc.models.uplink.interface import UplinkMethod, mean_power, root_mean_p
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
-PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the Gram matrix's mean diagonal
+PENALTIES = (10.0 ** np.arange(-6, 1)).tolist()  # of the Gram matrix's mean diagonal
 
 
 class Ridge(UplinkMethod):

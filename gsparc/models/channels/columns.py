@@ -19,8 +19,11 @@ from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.models.run_factors import best_run_factors, run_quadratic
 from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
+from gsparc.physics.waves import NEAR_M
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.places import ORIGIN, UNKNOWN
 
 NOBODY = -1  # in place of a station's number: none of them
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
@@ -66,13 +69,13 @@ class Slot:
     @classmethod
     def read(cls, state: dict[str, Any]) -> Slot:
         """Make the slot whose `state` this was."""
-        end = state["end"] if len(state["end"]) else torch.full((3,), math.nan, dtype=torch.float64)
+        end = state["end"] if len(state["end"]) else UNKNOWN
         entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
         return cls(**{**state, **entries, "end": end})
 
 
 @dataclass(frozen=True)
-class At:
+class SlotPlaces:
     """Places of one slot.
 
     Attributes:
@@ -85,7 +88,7 @@ class At:
 
 
 @dataclass(frozen=True)
-class Group(At):
+class Group(SlotPlaces):
     """Training rows of one slot.
 
     Attributes:
@@ -120,7 +123,7 @@ class Group(At):
 
     def state(self, factors: Tensor) -> dict[str, Any]:
         """Return what `read` reads; targets as measured, of runs of these factors."""
-        # Groups hold aligned targets, and `aligned` divides by the factors again when they are read.
+        # Groups hold aligned targets, and `align_runs` divides by the factors again when they are read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 
@@ -135,13 +138,13 @@ class Group(At):
         return to_numpy((self.places - self.places[0]).mul(1e6).round()).tobytes()
 
 
-def refuse(site: Site) -> None:
+def require_waves(site: Site) -> None:
     """Raise a `ValueError` for data that waves of a known length cannot explain."""
     if site.kind != "csi" or site.wavelength is None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 
 
-def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
+def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
     """Return groups of the given rows (n,).
 
     Args:
@@ -150,7 +153,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
         apart: whether antennas with places of their own and tones far apart are groups of their own; if not,
             all columns of a station are one, measured at the moving end's place at the carrier.
     """
-    refuse(data.site)
+    require_waves(data.site)
     alike, order = np.zeros(len(rows), np.int64), _order_of(data)
     run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
     station = alike if data.station is None or data.site.stations is None else data.station[rows]
@@ -186,31 +189,31 @@ def _order_of(data: Measurements) -> np.ndarray:
 def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
     centre, carrier = static_place(site, station), carrier_of(site, station)
-    zero, every = torch.zeros(3, dtype=torch.float64), tuple(range(antennas))
+    every = tuple(range(antennas))
     if not apart:
-        return [Slot(station, every, tuple(range(tones)), centre, zero, 2 * math.pi * carrier / LIGHT)]
+        return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
     # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
-    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, zero)]
+    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, ORIGIN)]
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
         # Antennas of a moving receiver are offsets in its frame, those of a static one are static ends.
         moves = site.static_end == "tx"
-        both = [(centre, one) if moves else (centre + rotation @ one, zero) for one in offsets]
+        both = [(centre, one) if moves else (centre + rotation @ one, ORIGIN) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
-    for band in bands(frequency, reach):
+    for band in coherent_bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
         slots += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
     return slots
 
 
-def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
+def coherent_bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
     """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
     # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
-    width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
+    width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, NEAR_M))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
 
@@ -220,7 +223,7 @@ def static_place(site: Site, station: int) -> Tensor:
     if site.stations is not None:
         return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
     if site.static_position is None:
-        return torch.full((3,), math.nan, dtype=torch.float64)
+        return UNKNOWN
     return torch.from_numpy(np.asarray(site.static_position, np.float64))
 
 
@@ -239,8 +242,8 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     A static end that is not where any station stands is of station `NOBODY`.
     """
     count = len(tx)
-    receiver = rx.position.reshape(-1, 3).expand(count, 3).cpu().double()
-    turned = rx.rotation.reshape(-1, 3, 3).expand(count, 3, 3).cpu().double()
+    receiver = rx.position.expand(count, -1).cpu().double()
+    turned = rx.rotation.expand(count, -1, -1).cpu().double()
     sender = tx.cpu().double()
     moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
     if site.static_end is None:
@@ -256,12 +259,12 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
 
 
-def ends_of(groups: tuple[Group, ...]) -> int:
+def count_static_ends(groups: tuple[Group, ...]) -> int:
     """Return how many static ends there are."""
     return len({group.slot.station for group in groups})
 
 
-def aligned(
+def align_runs(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
@@ -285,12 +288,12 @@ def aligned(
     return factors, known
 
 
-def misfit(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Return the negative log likelihood [nats] of what `aligned` says, scales profiled out."""
+def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
+    """Return the negative log likelihood [nats] of what `align_runs` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
-        nll += outputs * (count * math.log(max(given.scale, 1e-300)) + float(given.factor.log_determinant))
+        nll += outputs * (count * math.log(max(given.scale, TINY)) + float(given.factor.log_determinant))
         # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
@@ -301,17 +304,17 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
         # In units of its own power, as groups have scales of their own.
-        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, 1e-300)
+        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
     # `best_run_factors` tells what rows are to be multiplied by, the inverse of what they were.
     estimates[heard] = 1 / best_run_factors(quadratic[np.ix_(heard, heard)], size[heard])
     measured = torch.from_numpy(estimates)
-    return measured / measured.abs() if ends_of(groups) > 1 else measured
+    return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thinned(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
+def thin_groups(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
     """Return at most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Group, Slot
+from gsparc.models.channels.columns import Group, Slot, SlotPlaces
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.models.channels.terms.spherical import Spherical
+from gsparc.processes.density import TINY
 
 
 @dataclass(frozen=True)
-class Common:
+class SharedGains:
     """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
 
     Attributes:
@@ -30,7 +31,7 @@ class Common:
     level: float
 
     @staticmethod
-    def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> Common:
+    def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> SharedGains:
         """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
@@ -44,13 +45,13 @@ class Common:
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
         spread = (whole - steady) / count
         # Wiener's factor of the mean: its power over that with its error.
-        reliability = steady / (steady + spread).clamp_min(1e-300)
+        reliability = steady / (steady + spread).clamp_min(TINY)
         explained = steady * reliability
         # The direct wave stays: unsure as its gain may be, its shape is right.
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
-        return Common(gain * reliability, explained, sum(levels) / count)
+        return SharedGains(gain * reliability, explained, sum(levels) / count)
 
-    def at(self, prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
+    def at(self, prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
         before = self.level / _away(prior, at.slot) ** 2 * prior.variance(at)
         waves, _, away = _waves(prior, at)
@@ -59,7 +60,7 @@ class Common:
         return self.gain @ waves, after.clamp_min(0), before
 
 
-def _waves(prior: ChannelPrior, at: At) -> tuple[Tensor, Tensor, Tensor]:
+def _waves(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
     """Waves (J, n) of an end and its images, powers (J,) of fixed gains and distances to the middle (J,)."""
     terms = [term for term in prior.terms if isinstance(term, Spherical)]
     if not terms:

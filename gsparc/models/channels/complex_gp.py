@@ -22,32 +22,34 @@ from gsparc.data.blocks import take
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import Group, Slot, aligned, misfit
+from gsparc.models.channels.columns import Group, Slot, align_runs, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import IsotropicWaves, Kernel
-from gsparc.processes.nearest import Values, given, solved
-from gsparc.processes.neighbourhood import Neighbourhood, covering, spacing
-from gsparc.processes.posterior import Exact, Posterior, approximated
+from gsparc.processes.density import TINY
+from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
+from gsparc.processes.nearest import PlaceValues, condition_on_nearest, kriging_weights
+from gsparc.processes.neighbourhood import Neighbourhood, covering_rows, spacing
+from gsparc.processes.places import ORIGIN
+from gsparc.processes.posterior import Exact, Posterior, approximation_label
+from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import restored, stored
-from gsparc.processes.two_lengths import first_kernel, two_lengths
+from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
-NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
-CHOSEN_ON = 1_000  # rows that length and noise are chosen on: each look factors a matrix
-MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
+NOISES = (10.0 ** np.arange(-4, 1)).tolist()  # of the signal's power, candidates
+CHOSEN_ON = Effort.chosen_on  # rows that length and noise are chosen on: each look factors a matrix
 NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
 TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
 ENTRIES = 64  # of their channels
 REFINED = 3  # walks to the two lengths
 NAMED = 6  # factors of runs that a note gives
-ANY = Slot(0, (), (), torch.zeros(3), torch.zeros(3), 0.0)  # kernels know of no end
+ANY = Slot(0, (), (), ORIGIN, ORIGIN, 0.0)  # kernels know of no end
 
 
 class ComplexGP(ClosedForm):
@@ -67,7 +69,7 @@ class ComplexGP(ClosedForm):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, self.posterior)
+        return approximation_label(self.name, self.posterior)
 
     @property
     def kernel(self) -> Kernel:
@@ -93,15 +95,16 @@ class ComplexGP(ClosedForm):
         assert self.site is not None and self.site.wavelength is not None
         if self.site.phase_reference == "neighbours":
             at = places.numpy()
-            kernel, rows = first_kernel(self.site.wavelength, spacing(at)), (at, values.numpy())
+            kernel, rows = initial_kernel(self.site.wavelength, spacing(at)), (at, values.numpy())
             for _ in range(REFINED):
-                kernel = two_lengths(*rows, self.site.wavelength, kernel)
+                kernel = fit_two_lengths(*rows, self.site.wavelength, kernel)
             yield replace(kernel, amplitude=1.0)
             return
         for length in LENGTHS:
             for noise in NOISES:
                 wavenumber = 2 * math.pi / self.site.wavelength
-                yield Kernel((IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber),), noise)
+                waves = IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber)
+                yield Kernel((waves, WhiteNoise(noise)))
 
     def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
@@ -115,9 +118,9 @@ class ComplexGP(ClosedForm):
         if len(few) < len(rows):
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
         kernels = self._kernels(few.places, few.target)
-        kernel = min(kernels, key=lambda one: misfit(*_aligned(one, few, len(names))))
+        kernel = min(kernels, key=lambda one: negative_log_likelihood(*_aligned(one, few, len(names))))
         factors, ((_, told),) = _aligned(kernel, rows, len(names))
-        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), 1e-30)))
+        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
         self.posterior = Exact.of(prior, places, told.values, None, told.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
@@ -131,20 +134,22 @@ class ComplexGP(ClosedForm):
         """
         targets = take(data.target, known).reshape(len(known), -1)
         first, means, count = mean_at_places(data.moving[known], targets)
-        values = Values(data.moving[known[first]], torch.from_numpy(means), torch.from_numpy(count).double())
+        values = PlaceValues(
+            data.moving[known[first]], torch.from_numpy(means), torch.from_numpy(count).double()
+        )
         squares = mean_at_places(data.moving[known], _power(targets))[1]
         scatter = torch.from_numpy((count * (squares - _power(means))).clip(0))
         near = Neighbourhood.of(values.places, 0)
-        row = covering(values.places, TRIED_ON, 0)
+        row = covering_rows(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
         at = torch.from_numpy(values.places)
         sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
         kernels = self._kernels(at, values.values)
         kernel = min(kernels, key=lambda one: _density(one, *sample))
-        power = max(float(sample[1][:, 0].abs().square().mean()), 1e-30)
+        power = max(float(sample[1][:, 0].abs().square().mean()), TINY)
         prior = Prior(replace(kernel, amplitude=power))
-        self.posterior = given(prior, values, 0, most=NEAREST)
+        self.posterior = condition_on_nearest(prior, values, 0, most=NEAREST)
         self.runs = RunFactors.none()
         of = f"of {len(count)} places, of" if len(count) < len(known) else "of"
         by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
@@ -195,10 +200,10 @@ def _power(channels: np.ndarray) -> np.ndarray:
 
 
 def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """See `columns.aligned`; of a kernel of unit power."""
+    """See `columns.align_runs`; of a kernel of unit power."""
     gram = kernel.between(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
-    return aligned((rows,), [gram], runs)
+    return align_runs((rows,), [gram], runs)
 
 
 def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
@@ -211,10 +216,10 @@ def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter
     """
     covariance, noise = kernel.between(at, at), kernel.noise / counts
     gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:])
-    weights, known = solved(gram, covariance[:, 0, 1:])
+    weights, known = kriging_weights(gram, covariance[:, 0, 1:])
     missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
     variance, again = 1 + noise[:, 0] - known, float((counts[:, 0] - 1).sum())
     power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
     spread = float(variance.log().sum()) + again * math.log(kernel.noise)
     count = len(at) + again
-    return math.log(max(power / count, 1e-300)) + spread / count
+    return math.log(max(power / count, TINY)) + spread / count

@@ -18,10 +18,11 @@ from torch import Tensor
 from gsparc.models.channels.columns import Group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Isotropic, Noise
-from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, cached
+from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, get_or_make
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.left_out import left_out as left_out_rows
+from gsparc.processes.density import TINY
+from gsparc.processes.left_out import left_out_residuals as left_out_rows
 from gsparc.processes.worker import stop_when_late
 
 WEAK = 1e-3  # pull of every parameter to where it started, which holds those that nothing depends on
@@ -32,7 +33,7 @@ Grouping = list[Tensor] | None  # rows that are left out together; None: one by 
 
 
 @dataclass(frozen=True)
-class Compressed:
+class GroupInBasis:
     """A group's signal in a basis.
 
     Attributes:
@@ -52,11 +53,11 @@ class Compressed:
     rest: float
 
     @staticmethod
-    def of(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> Compressed:
+    def of(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> GroupInBasis:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
-        return Compressed(group, basis, pieces, design, target, rest)
+        return GroupInBasis(group, basis, pieces, design, target, rest)
 
     @property
     def is_whole(self) -> bool:
@@ -65,11 +66,11 @@ class Compressed:
 
     def own(self, prior: ChannelPrior) -> Tensor:
         """Return powers (P,) as this end has them."""
-        return (self.design @ parameters(prior)).exp()
+        return (self.design @ learned_parameters(prior)).exp()
 
 
 @dataclass(frozen=True)
-class Solved:
+class SolvedGroup:
     """A group's covariance with one set of powers, factored.
 
     Attributes:
@@ -83,26 +84,26 @@ class Solved:
     scale: float
 
 
-def learned(prior: ChannelPrior) -> tuple[ChannelTerm, ...]:
+def learned_terms(prior: ChannelPrior) -> tuple[ChannelTerm, ...]:
     """Return terms whose powers evidence knows: signal and white noise."""
     return *prior.signals, prior[Noise]
 
 
-def parameters(prior: ChannelPrior) -> Tensor:
-    """Return those of `learned` terms (Q,)."""
-    return torch.cat([term.parameters() for term in learned(prior)])
+def learned_parameters(prior: ChannelPrior) -> Tensor:
+    """Return those of `learned_terms` terms (Q,)."""
+    return torch.cat([term.parameters() for term in learned_terms(prior)])
 
 
-def normalised(group: Group) -> Group:
+def normalise_power(group: Group) -> Group:
     """Return the same with targets of unit mean square."""
     # A silent group stays 0 instead of 0 / 0.
-    level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
+    level = group.target.abs().square().mean().clamp_min(TINY).sqrt()
     return replace(group, target=group.target / level)
 
 
-def compressed(
+def compress_groups(
     groups: tuple[Group, ...], prior: ChannelPrior, cache: Cache | None = None
-) -> tuple[Compressed, ...]:
+) -> tuple[GroupInBasis, ...]:
     """Return signals of all groups; of one set of displacements and wavelength they share the basis.
 
     `cache` keeps matrices of places that further candidates and groups need again.
@@ -113,23 +114,23 @@ def compressed(
     for group in groups:
         key = group.displacements, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
-        basis = cached(cache, key, partial(Basis.of, key, group.places, alike, noise, cache))
+        basis = get_or_make(cache, key, partial(Basis.of, key, group.places, alike, noise, cache))
         pieces = tuple(piece for term in prior.signals for piece in term.pieces(group, basis))
-        design = torch.block_diag(*(term.design(group.slot) for term in learned(prior)))
-        parts.append(Compressed.of(group, basis.columns, pieces, design))
+        design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
+        parts.append(GroupInBasis.of(group, basis.columns, pieces, design))
     return tuple(parts)
 
 
-def without(part: Compressed, left: Tensor) -> Compressed:
+def without_rows(part: GroupInBasis, left: Tensor) -> GroupInBasis:
     """Return the rows but those of `left` (n,) bool, from the same matrices."""
     rest = torch.nonzero(~left).flatten()
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
     pieces = tuple(piece.within(mixed) for piece in part.pieces)
-    return Compressed.of(part.group.take(rest), basis, pieces, part.design)
+    return GroupInBasis.of(part.group.take(rest), basis, pieces, part.design)
 
 
-def solved(part: Compressed, power: Tensor) -> Solved:
+def solve_group(part: GroupInBasis, power: Tensor) -> SolvedGroup:
     """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
@@ -141,12 +142,12 @@ def solved(part: Compressed, power: Tensor) -> Solved:
     count, outputs = part.group.target.shape
     # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
     quadratic = given.scale * part.target.numel() + part.rest / noise
-    scale = max(quadratic / (count * outputs), 1e-300)
+    scale = max(quadratic / (count * outputs), TINY)
     determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
-    return Solved(outputs * (count * math.log(scale) + determinant), given, scale)
+    return SolvedGroup(outputs * (count * math.log(scale) + determinant), given, scale)
 
 
-def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
+def power_gradient(part: GroupInBasis, power: Tensor, at: SolvedGroup) -> Tensor:
     """Return the gradient (P,) of the negative log likelihood by logarithms of own powers."""
     count, outputs = part.group.target.shape
     weights = at.given.weights
@@ -157,21 +158,21 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     return torch.cat([*(piece.traces(weight) for piece in part.pieces), noise[None]]) * power
 
 
-def evidence(parts: tuple[Compressed, ...], prior: ChannelPrior) -> float:
+def negative_log_evidence(parts: tuple[GroupInBasis, ...], prior: ChannelPrior) -> float:
     """Return the negative log marginal likelihood of all groups [nats]."""
-    return sum(solved(part, part.own(prior)).nll for part in parts)
+    return sum(solve_group(part, part.own(prior)).nll for part in parts)
 
 
 def fit_powers(
-    parts: tuple[Compressed, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
+    parts: tuple[GroupInBasis, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
 ) -> tuple[ChannelPrior, float]:
-    """Fit parameters of largest evidence of all `learned` terms; see `fit_terms`."""
-    fitted, nll = fit_terms(parts, learned(prior), shrinkage, steps)
+    """Fit parameters of largest evidence of all `learned_terms` terms; see `fit_terms`."""
+    fitted, nll = fit_terms(parts, learned_terms(prior), shrinkage, steps)
     return prior.changed(*fitted), nll
 
 
 def fit_terms(
-    parts: Sequence[Compressed], terms: tuple[ChannelTerm, ...], shrinkage: float, steps: int
+    parts: Sequence[GroupInBasis], terms: tuple[ChannelTerm, ...], shrinkage: float, steps: int
 ) -> tuple[tuple[ChannelTerm, ...], float]:
     """Fit parameters of largest evidence; return its negative logarithm without the priors too.
 
@@ -198,9 +199,9 @@ def fit_terms(
         at, total = at.detach(), float(value.detach())
         for part in parts:
             own = (part.design @ at).exp()
-            now = solved(part, own)
+            now = solve_group(part, own)
             total += now.nll
-            gradient = gradient + part.design.T @ slope(part, own, now)
+            gradient = gradient + part.design.T @ power_gradient(part, own, now)
         return total, gradient.numpy()
 
     optimum = minimize(
@@ -209,15 +210,15 @@ def fit_terms(
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)
     fitted = tuple(term.at(own) for term, own in zip(terms, found.split(sizes), strict=True))
-    return fitted, sum(solved(part, (part.design @ found).exp()).nll for part in parts)
+    return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
 
 
-def left_out(part: Compressed, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
+def left_out_errors(part: GroupInBasis, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
     """Return errors (n, D) of rows left out in groups, of each grouping (Rasmussen and Williams, 5.12).
 
     Powers (P,) are its own.
     """
-    at, noise, wide = solved(part, power), power[-1], part.basis.to(torch.complex128)
+    at, noise, wide = solve_group(part, power), power[-1], part.basis.to(torch.complex128)
     alpha = wide @ at.given.weights + (part.group.target - wide @ part.target) / noise
     # The inverse is that of the covariance in the basis, and 1 / noise on what is orthogonal to it.
     outside = torch.eye(len(wide), dtype=torch.float64) - part.basis @ part.basis.T

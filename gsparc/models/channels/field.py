@@ -15,8 +15,16 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import At, Group, Slot, aligned, gather, query_ends, static_place
-from gsparc.models.channels.common import Common
+from gsparc.models.channels.columns import (
+    Group,
+    Slot,
+    SlotPlaces,
+    align_runs,
+    group_channels,
+    query_ends,
+    static_place,
+)
+from gsparc.models.channels.common import SharedGains
 from gsparc.models.channels.initial import ChannelSettings, find_terms
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct, Images
@@ -25,11 +33,12 @@ from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.ops.transforms import to_numpy
 from gsparc.processes.conditioned import Conditioned
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.stored import restored, stored
 from gsparc.training.context import FitContext, FitReport
 
-CHUNK = 2_000_000  # entries of a covariance that are held at a time
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
 CHECKED = 64  # rows that this is tried at
 
@@ -90,7 +99,7 @@ class ChannelField(ClosedForm):
         self.settings = settings or ChannelSettings()
         self.weights: tuple[Weights, ...] = ()
         self.stations: dict[int, list[Weights]] = {}
-        self.common: Common | None = None
+        self.common: SharedGains | None = None
         self.rows = np.zeros(0, np.int64)
         self.runs = RunFactors.none()
 
@@ -138,29 +147,29 @@ class ChannelField(ClosedForm):
             )
         self.rows = np.asarray(rows)
         runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
-        self._solve(gather(data, self.rows, self.apart), runs, None)
+        self._solve(group_channels(data, self.rows, self.apart), runs, None)
 
     def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
         prior = self.prior
         both = zip(prior.of_groups(groups), groups, strict=True)
         covariances = [signal + prior.disturbance(group) for signal, group in both]
-        factors, told = aligned(groups, covariances, len(runs), factors)
+        factors, told = align_runs(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
-        self.weights = tuple(Weights(group, given, max(given.scale, 1e-300), *rest) for group, given in told)
+        self.weights = tuple(Weights(group, given, max(given.scale, TINY), *rest) for group, given in told)
         self.stations = {}
         for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
         heard = [(known.group, known.given.weights, known.scale) for known in self.weights]
         # One end alone does not tell what ends have in common.
-        self.common = Common.of(prior, heard) if len(self.stations) > 1 else None
+        self.common = SharedGains.of(prior, heard) if len(self.stations) > 1 else None
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
 
         Without stations those at the static places are asked, the first of several at one. Of one that no
-        row was learned of, what ends have in common answers (`Common`).
+        row was learned of, what ends have in common answers (`SharedGains`).
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
         longest = max(len(each.group) for each in self._conditioned())
@@ -170,13 +179,13 @@ class ChannelField(ClosedForm):
         dtype, device = query.tx.dtype, query.tx.device
         parts = [
             self._answer(moving[part], static[part], turned[part], station[part], dtype)
-            for part in torch.arange(len(moving)).split(max(CHUNK // longest, 1))
+            for part in torch.arange(len(moving)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
             mean.to(device),
             after.to(dtype).to(device),
-            (after / before.clamp_min(1e-300)).clamp(0, 1).to(dtype).to(device),
+            (after / before.clamp_min(TINY)).clamp(0, 1).to(dtype).to(device),
             share.to(device) if self.size() else None,
         )
         return self.runs.restored(told, query.run)
@@ -199,7 +208,7 @@ class ChannelField(ClosedForm):
                 total.index_add_(0, here, part * (said.shape[1] / size))
 
         for alike in self._by_places(moving, turned, station):
-            asked = [At(known.group.slot, places) for known, _, places in alike]
+            asked = [SlotPlaces(known.group.slot, places) for known, _, places in alike]
             crosses = prior.together(asked, [known.group for known, _, _ in alike])
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
                 if images is not None:
@@ -218,7 +227,7 @@ class ChannelField(ClosedForm):
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
-                at = At(slot, slot.places(moving[here], turned[here]))
+                at = SlotPlaces(slot, slot.places(moving[here], turned[here]))
                 common, left, whole = self.common.at(prior, at)
                 tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,43 +18,50 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
-from gsparc.models.channels.columns import Group, aligned, ends_of, gather, misfit, thinned
+from gsparc.models.channels.columns import (
+    Group,
+    align_runs,
+    count_static_ends,
+    group_channels,
+    negative_log_likelihood,
+    thin_groups,
+)
 from gsparc.models.channels.complex_gp import LENGTHS, NOISES
 from gsparc.models.channels.evidence import (
-    Compressed,
+    GroupInBasis,
     Grouping,
-    compressed,
-    evidence,
+    compress_groups,
     fit_powers,
-    left_out,
-    normalised,
-    without,
+    left_out_errors,
+    negative_log_evidence,
+    normalise_power,
+    without_rows,
 )
-from gsparc.models.channels.kernels import cells, directions, plain
+from gsparc.models.channels.kernels import bisected_cells, isotropic_correlation, spread_directions
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.probe import best_offset
+from gsparc.models.channels.probe import find_static_offset
 from gsparc.models.channels.terms import Direct, Directions, Images, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.compressed import Cache
 from gsparc.models.channels.terms.term import Frame
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.left_out import groups_of
+from gsparc.processes.left_out import rows_of_groups
+from gsparc.processes.places import ORIGIN, of_both_ends
 from gsparc.processes.worker import Cancelled, cancelled_by
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 BEYOND = 10.0  # extents of the places after which nothing is known any more
 COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
 ENDS = 64  # of several static ends, those that powers are learned on in the end
 CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
 SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
-ALIGNED = (
-    1_500  # rows that tell factors of runs: of 2,400 they turn them by two degrees, in a third of the time
-)
+ALIGNED = 1_500  # rows that tell factors of runs: two degrees from those of 2,400, in a third of the time
 FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 LEAST = 1e-3  # of all powers: sources below are dropped
+SHARED = 0.3  # of the power, what directions have in common before they are learned
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
 ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
@@ -85,7 +93,7 @@ class ChannelSettings:
     directions: bool = True
     correlated: bool = True
     angles: int = 24
-    rows: int = 400
+    rows: int = Effort.term_rows
     tied: int = 64
     narrow: float = 16.0
     knots: int = 9
@@ -127,12 +135,12 @@ def find_terms(
         ValueError: the data are no channels of a known carrier with one static end.
     """
     start, factors, note = _isotropic(data, rows, budget)
-    every = gather(data, rows, True)
-    every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
+    every = group_channels(data, rows, True)
+    every = tuple(normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
     most = budget.effort.term_rows
-    groups, cache = thinned(every, COLUMNS, most), Cache()
-    if compressed(groups[:1], start, cache)[0].is_whole:
-        groups = thinned(every, DENSE_COLUMNS, min(most, DENSE_ROWS))
+    groups, cache = thin_groups(every, COLUMNS, most), Cache()
+    if compress_groups(groups[:1], start, cache)[0].is_whole:
+        groups = thin_groups(every, DENSE_COLUMNS, min(most, DENSE_ROWS))
     notes, wavelength = [note], 2 * math.pi / every[0].slot.wavenumber
     search = _Search(replace(settings, rows=most), groups, every, wavelength, cache)
     steps = [search._measured(start, search._compressed(start))]
@@ -144,38 +152,38 @@ def find_terms(
     return steps[-1].prior, tuple(notes)
 
 
-def factors_of_runs(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> RunFactors:
+def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> RunFactors:
     """Return the factor of each run of channels at rows (n,), by the waves that explain them."""
     # Directions turn factors by a degree and double the seconds.
     few = ChannelSettings(directions=False, correlated=False, mirrors=0)
     prior, _ = find_terms(data, rows, few, budget)
-    runs, groups = np.unique(np.asarray(data.run)[rows]), thinned(gather(data, rows, True), COLUMNS, ALIGNED)
-    covariances = [
-        signal + prior.disturbance(group)
-        for signal, group in zip(prior.of_groups(groups), groups, strict=True)
-    ]
-    return RunFactors(runs, aligned(groups, covariances, len(runs))[0])
+    groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
+    both = zip(prior.of_groups(groups), groups, strict=True)
+    runs = np.unique(np.asarray(data.run)[rows])
+    factors, _ = align_runs(groups, [signal + prior.disturbance(group) for signal, group in both], len(runs))
+    return RunFactors(runs, factors)
 
 
 def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[ChannelPrior, Tensor, str]:
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
-    groups = gather(data, rows, False)
-    looked = thinned(groups, 8, budget.effort.chosen_on)
+    groups = group_channels(data, rows, False)
+    looked = thin_groups(groups, COLUMNS, budget.effort.chosen_on)
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried: list[tuple[float, Tensor, float, float]] = []
     for length in LENGTHS:
-        bounded = [plain(g.places, g.places, g.slot.wavenumber, length * wavelength) for g in looked]
+        isotropic = partial(isotropic_correlation, length=length * wavelength)
+        bounded = [isotropic(g.places, g.places, g.slot.wavenumber) for g in looked]
         for noise in NOISES:
             if tried and budget.over():
                 break
             eye = [noise * torch.eye(len(each), dtype=each.dtype) for each in bounded]
-            factors, told = aligned(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
-            tried.append((misfit(factors, told), factors, length * wavelength, noise))
+            factors, told = align_runs(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
+            tried.append((negative_log_likelihood(factors, told), factors, length * wavelength, noise))
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
-    reach, none = BEYOND * max(extent, wavelength), torch.zeros(3, dtype=torch.float64)
+    reach, none = BEYOND * max(extent, wavelength), ORIGIN
     frame = Frame(everywhere.mean(0), reach, length, GAINS[0] * wavelength, none)
     one = torch.ones(1, dtype=torch.float64)
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
@@ -196,13 +204,13 @@ def _strongest(prior: ChannelPrior) -> ChannelPrior:
 
 def _groupings(places: Tensor) -> list[Grouping]:
     """Rows (n,) left out one by one, then in the cells of each of `DEPTHS`."""
-    deep = [groups_of(cells(places.numpy(), depth)) for depth in DEPTHS]
+    deep = [rows_of_groups(bisected_cells(places.numpy(), depth)) for depth in DEPTHS]
     return [None, *(groups if len(groups) < len(places) else None for groups in deep)]
 
 
-def _left_out(part: Compressed, prior: ChannelPrior) -> np.ndarray:
+def _left_out(part: GroupInBasis, prior: ChannelPrior) -> np.ndarray:
     """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
-    errors = left_out(part, part.own(prior), _groupings(part.group.places))
+    errors = left_out_errors(part, part.own(prior), _groupings(part.group.places))
     return np.stack([error.abs().square().mean(1).numpy() for error in errors])
 
 
@@ -229,13 +237,13 @@ class _Search:
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
             step(self._with_fixed(steps[-1], direct), "leakage and direct wave")
-        if wanted.mirrors and steps[-1].prior.get(Direct) and ends_of(self.every) > 1:
+        if wanted.mirrors and steps[-1].prior.get(Direct) and count_static_ends(self.every) > 1:
             mirrored = self._with_mirrors(steps[-1])
             if mirrored is not None:
                 step(mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})")
         if wanted.directions and one_end:
             step(self._with_directions(steps[-1]), "directions")
-        if ends_of(self.every) > 1:
+        if count_static_ends(self.every) > 1:
             self._of_all_ends(steps, known, notes)
         if wanted.correlated:
             steps.append(self._with_drift(steps[-1], notes))
@@ -250,13 +258,13 @@ class _Search:
         )
         return after if keep else before
 
-    def _compressed(self, prior: ChannelPrior) -> tuple[Compressed, ...]:
-        return compressed(self.groups, prior, self.cache)
+    def _compressed(self, prior: ChannelPrior) -> tuple[GroupInBasis, ...]:
+        return compress_groups(self.groups, prior, self.cache)
 
-    def _measured(self, prior: ChannelPrior, parts: tuple[Compressed, ...]) -> Candidate:
+    def _measured(self, prior: ChannelPrior, parts: tuple[GroupInBasis, ...]) -> Candidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out(part, prior).mean(1) for part in parts], axis=0)
-        return Candidate(prior, evidence(parts, prior) + self._worth(prior), errors)
+        return Candidate(prior, negative_log_evidence(parts, prior) + self._worth(prior), errors)
 
     def _fitted(self, prior: ChannelPrior) -> Candidate:
         """With powers of largest evidence; measured."""
@@ -271,7 +279,7 @@ class _Search:
     @property
     def one_end(self) -> bool:
         """Whether one end stands."""
-        return self.every[0].places.shape[1] == 3
+        return not of_both_ends(self.every[0].places)
 
     def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
@@ -293,7 +301,7 @@ class _Search:
         prior = candidate.prior
         if prior.get(Direct) is None or not self.one_end:
             return candidate
-        offset = best_offset(self._compressed(prior), prior, self.wavelength)
+        offset = find_static_offset(self._compressed(prior), prior, self.wavelength)
         if offset is None:
             return candidate
         moved = self._fitted(prior.framed(offset=offset))
@@ -302,8 +310,8 @@ class _Search:
     def _with_mirrors(self, before: Candidate) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
         prior = before.prior
-        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(prior)
-        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
+        rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(prior)
+        wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         most = self.settings.mirrors
         planes = find_mirrors(rough, wide._compressed(prior), prior, self.wavelength, most)
         if not len(planes):
@@ -327,7 +335,7 @@ class _Search:
 
     def _of_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
-        wide = replace(self, groups=thinned(self.every, ENDS, self.settings.rows))
+        wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         steps.append(wide._fitted(steps[-1].prior))
         steps.append(wide._moved(steps[-1]))
         if known and self.settings.directions:
@@ -340,21 +348,21 @@ class _Search:
     ) -> ChannelPrior:
         """With so many directions in place of those there are, of equal powers and factors."""
         group, isotropic, old = max(self.groups, key=len), prior[Isotropic], prior.get(Directions)
-        angles = directions(group.places, group.slot.wavenumber, count)
+        angles = spread_directions(group.places, group.slot.wavenumber, count)
         level = isotropic.power if old is None else isotropic.power + old.power.sum()
-        power = (0.7 * level / len(angles)).repeat(len(angles))
+        power = ((1 - SHARED) * level / len(angles)).repeat(len(angles))
         towards = torch.zeros(knots, dtype=torch.float64)
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
-        return prior.changed(replace(isotropic, power=0.3 * level), fresh)
+        return prior.changed(replace(isotropic, power=SHARED * level), fresh)
 
-    def _crossed(self, parts: tuple[Compressed, ...], prior: ChannelPrior) -> np.ndarray:
+    def _crossed(self, parts: tuple[GroupInBasis, ...], prior: ChannelPrior) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
-        number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
+        number = [bisected_cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
         errors = np.zeros(1 + len(DEPTHS))
         for fold in range(FOLDS):
             in_fold = [np.equal(each, fold) for each in number]
             both = zip(parts, in_fold, strict=True)
-            rest = tuple(without(part, torch.from_numpy(left)) for part, left in both if not left.all())
+            rest = tuple(without_rows(part, torch.from_numpy(left)) for part, left in both if not left.all())
             # Of few rows all may be of one fold: then nothing tells powers.
             learned = fit_powers(rest, prior, SHRINKAGE, 2 * SHORT)[0] if rest else prior
             for part, left in zip(parts, in_fold, strict=True):
@@ -362,9 +370,9 @@ class _Search:
         return errors
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
-        groups = drift.contiguous_rows(self.every)
+        groups = drift.contiguous_stretches(self.every)
         known = before.prior.of_groups(groups)
-        prior, gain = drift.with_drift(groups, known, before.prior)
+        prior, gain = drift.fit_drift(groups, known, before.prior)
         errors = np.zeros((2, 1 + len(DEPTHS)))
         for group, signal in zip(groups, known, strict=True):
             for sums, at in zip(errors, (before.prior, prior), strict=True):

@@ -18,20 +18,24 @@ from gsparc.ops.transforms import needs_reference
 from gsparc.physics.waves import NEAR_M
 from gsparc.processes.kernel import IsotropicWaves, matern32_of_squares
 
+SMALL = 1e-12  # z whose sinh(z) / z is 1
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
 
 
-def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
+GOLDEN = (1 + math.sqrt(5)) / 2
+
+
+def matern_envelope(distance: Tensor, length: Tensor | float) -> Tensor:
     """Return Matern-3/2 of distances [m]."""
     return matern32_of_squares((distance / length).square())
 
 
-def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
+def squared_exponential(distance: Tensor, length: Tensor | float) -> Tensor:
     """Return the squared exponential of distances [m]."""
     return torch.exp(-0.5 * (distance / length).square())
 
 
-def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
+def directional_correlation(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
     """Return the correlation (...) complex128 of waves that come from about one direction.
 
     Args:
@@ -41,22 +45,22 @@ def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
     """
     if squared.requires_grad or along.requires_grad or needs_reference(squared, along):
         root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
-        root = torch.where(root.abs() < 1e-9, root + 1e-9, root)
+        root = torch.where(root.abs() < SMALL, root + SMALL, root)
         return root.sinh() / root * (concentration / math.sinh(concentration))
     # In real numbers and in place: complex sqrt and sinh take four times as long.
     with torch.no_grad():
         real, imag = concentration**2 - squared, 2 * concentration * along
         size = (real.square() + imag.square()).sqrt_()
-        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(1e-12)
+        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(SMALL)
         smaller = imag.div_(2 * larger)
         a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
         rising, falling = a.exp(), (-a).exp()
         x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
-        share = size.clamp_min_(1e-24).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
+        share = size.clamp_min_(SMALL**2).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
         return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
-def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
+def isotropic_correlation(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
     """Return the correlation (..., n, m) float64 of waves from everywhere alike, in an envelope [m].
 
     Where both ends move, waves leave in all directions as they arrive from all: the product over the ends.
@@ -67,7 +71,7 @@ def plain(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Te
     return IsotropicWaves(length, wavenumber=wavenumber).covariance(a, b)
 
 
-def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
+def spherical_wave(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
     """Return the wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
     away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
     # The amplitude stops growing a quarter of a wavelength away, where no antenna is a point.
@@ -75,29 +79,30 @@ def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tenso
     return torch.polar(level, -wavenumber * away)
 
 
-def sphere(count: int) -> Tensor:
+def fibonacci_sphere(count: int) -> Tensor:
     """Return unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * number / count, math.pi * (1 + 5**0.5) * number
+    height, turn = 1 - 2 * number / count, 2 * math.pi * GOLDEN * number
     radius = (1 - height.square()).sqrt()
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
 
 
-def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
+def spread_directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
     """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3) lie in a plane."""
     centred = places - places.mean(0)
-    axes = torch.linalg.svd(centred, full_matrices=False)[2] if len(places) > 2 else torch.eye(3).double()
+    few = torch.eye(places.shape[1], dtype=torch.float64)
+    axes = torch.linalg.svd(centred, full_matrices=False).Vh if len(places) > 2 else few
     height = (centred @ axes[-1]).abs().max()
     if float(height) * wavenumber > FLAT_RAD:
-        return sphere(count)
-    half = sphere(2 * count)
+        return fibonacci_sphere(count)
+    half = fibonacci_sphere(2 * count)
     half = half[half[:, 2] > 0]
     # Columns of `basis` are two axes of the plane and its normal.
     basis = torch.stack([axes[0], axes[1], torch.linalg.cross(axes[0], axes[1])], 1)
     return half @ basis.T
 
 
-def cells(places: np.ndarray, depth: int) -> np.ndarray:
+def bisected_cells(places: np.ndarray, depth: int) -> np.ndarray:
     """Return numbers (n,) of 2^depth cells of near places (n, 3), halved across the widest axis."""
     number = np.zeros(len(places), np.int64)
     for _ in range(depth):

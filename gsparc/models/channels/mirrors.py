@@ -14,11 +14,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.evidence import Compressed
+from gsparc.models.channels.evidence import GroupInBasis
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.probe import Probe, summed_gains
+from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Images
 from gsparc.models.channels.terms.term import Frame
+from gsparc.processes.density import TINY
 from gsparc.processes.worker import raise_if_cancelled
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
@@ -26,13 +27,16 @@ MARGIN = 0.3  # how far beyond places and ends planes may be, of their extent
 LEAST_MARGIN_M = 2.0  # and at least
 TURN_RAD = 1.5  # phase across the places that a plane's azimuth may be off by
 STEP = 0.25  # wavelengths between offsets
-MOST_TURNS, MOST_OFFSETS = 96, 400  # of the grid
+MOST_QUARTERS, MOST_OFFSETS = 24, 400  # of the grid
 PROMISING = 2000  # planes that are looked at again after the first was found
 STARTS = 3  # planes that are moved to their best, of which the best is tried
 APART = 1.0  # wavelengths between the images of some end in two of them
 REFINED = 5  # halvings of the step
 LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
+
+LOOKED_AT = 32  # planes that tell what is known of all of a grid
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 Probes = tuple[Probe, ...]
 
@@ -53,7 +57,7 @@ class _Searcher:
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
             return Images.of(self.frame, planes[chunk]).waves(probe.group)
 
-        return summed_gains(probes, len(planes), waves, LEVELS, known)
+        return likelihood_gains(probes, len(planes), waves, LEVELS, known)
 
     def keep(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""
@@ -80,27 +84,28 @@ class _Searcher:
     def moved(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
         middle, shift = self.frame.middle, STEP * self.wavelength / 2
-        across = torch.linalg.cross(plane[:3], torch.tensor([0.0, 0.0, 1.0]).double())
+        normal, away = plane[:-1], plane[-1]
+        across = torch.linalg.cross(normal, UP)
         if float(across.norm()) < 0.5:
             across = torch.tensor([1.0, 0.0, 0.0]).double()
-        axes = torch.stack([across, torch.linalg.cross(plane[:3], across)])
+        axes = torch.stack([across, torch.linalg.cross(normal, across)])
         steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
         moves = torch.cartesian_prod(steps, steps, steps)
         for halving in range(REFINED):
             share = 0.5**halving
-            normal = plane[:3] + share * turn * moves[:, :2] @ axes
-            normal = normal / normal.norm(dim=1, keepdim=True)
-            away = plane[3] - plane[:3] @ middle + share * shift * moves[:, 2]
-            tried = torch.cat([normal, (away + normal @ middle)[:, None]], 1)
+            turned = normal + share * turn * moves[:, :2] @ axes
+            turned = turned / turned.norm(dim=1, keepdim=True)
+            shifted = away - normal @ middle + share * shift * moves[:, 2]
+            tried = torch.cat([turned, (shifted + turned @ middle)[:, None]], 1)
             gains = self.gains(self.probes, tried)
             best = int(gains.argmax()) // len(LEVELS)
             plane, level = tried[best], LEVELS[int(gains[best].argmax())]
-            gain = float(gains[best].max())
+            (normal, away), gain = (plane[:-1], plane[-1]), float(gains[best].max())
         return plane, level, gain
 
 
 def find_mirrors(
-    coarse: tuple[Compressed, ...], parts: tuple[Compressed, ...], prior: ChannelPrior,
+    coarse: tuple[GroupInBasis, ...], parts: tuple[GroupInBasis, ...], prior: ChannelPrior,
     wavelength: float, most: int,
 ) -> Tensor:  # fmt: skip
     """Return planes (W, 4) float64, local; none where all together are not worth it.
@@ -116,7 +121,7 @@ def find_mirrors(
     search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidates(rough, prior.frame, wavelength)
+    grid, turn = candidate_planes(rough, prior.frame, wavelength)
     while len(search.planes) < most:
         raise_if_cancelled()
         scores = search.gains(search.rough, grid, _about).max(1).values
@@ -131,29 +136,30 @@ def find_mirrors(
     return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
-def candidates(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
+def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
     """Return upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
     points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])
     extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))
-    count = min(max(math.ceil(2 * math.pi**2 * extent / wavelength / TURN_RAD), 4), MOST_TURNS)
-    azimuth = torch.arange(4 * math.ceil(count / 4), dtype=torch.float64)
+    # Of a half turn: walls, those across them and diagonal ones are all there.
+    quarter = math.ceil(math.pi**2 / 2 * extent / wavelength / TURN_RAD)
+    azimuth = torch.arange(4 * min(max(quarter, 1), MOST_QUARTERS), dtype=torch.float64)
     turn = math.pi / len(azimuth)
     normals = torch.stack([(azimuth * turn).cos(), (azimuth * turn).sin(), 0 * azimuth], 1)
     planes = []
-    for normal in torch.cat([normals, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)]):
+    for normal in torch.cat([normals, UP[None]]):
         low, high = (points @ normal).aminmax()
         margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
         number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
         offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
         offsets = offsets[(offsets - frame.middle @ normal).abs() > STEP * wavelength]
-        planes.append(torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1))
+        planes.append(torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1))
     return torch.cat(planes), turn
 
 
 def _about(probe: Probe, waves: Tensor) -> Tensor:
     """`Probe.known` by that of a few: an isotropic field knows waves from everywhere alike."""
     size = waves.abs().square().sum(1)
-    few = torch.linspace(0, len(waves) - 1, min(32, len(waves))).long()
-    share = probe.known(waves[few]).sum() / size[few].sum().clamp_min(1e-30)
+    few = torch.linspace(0, len(waves) - 1, min(LOOKED_AT, len(waves))).long()
+    share = probe.known(waves[few]).sum() / size[few].sum().clamp_min(TINY)
     return size * share

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Group
+from gsparc.models.channels.columns import Group, SlotPlaces
 from gsparc.models.channels.terms import KINDS, Noise
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.processes.stored import Stored
@@ -75,7 +75,7 @@ class ChannelPrior(Stored):
         """Variance () of what is no signal."""
         return torch.cat([term.power for term in self.terms if not term.is_signal]).sum()
 
-    def together(self, a: Sequence[At], b: Sequence[At]) -> Iterator[Tensor]:
+    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterator[Tensor]:
         """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.together`."""
         for parts in zip(*(term.together(a, b) for term in self.signals), strict=True):
             # From the first part on: `0 + tensor` would copy a matrix for nothing.
@@ -98,7 +98,7 @@ class ChannelPrior(Stored):
         parts = [term.covariance(group, group) for term in self.terms if not term.is_signal]
         return sum(parts[1:], parts[0])
 
-    def variance(self, at: At) -> Tensor:
+    def variance(self, at: SlotPlaces) -> Tensor:
         """Return the variance (n,) of the signal."""
         parts = [term.variance(at) for term in self.signals]
         return sum(parts[1:], parts[0])

@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.evidence import Compressed, solved
+from gsparc.models.channels.evidence import GroupInBasis, solve_group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.left_out import ENTRIES
+from gsparc.processes.places import ORIGIN
 
-CHUNK = 300_000  # entries of waves held at a time
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
 REFINED = 3  # halvings of the step
-NONE = 1e-12  # power of a wave that is left out
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,9 @@ class Probe:
     scale: float
 
     @staticmethod
-    def of(part: Compressed, prior: ChannelPrior) -> Probe:
+    def of(part: GroupInBasis, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
-        at, basis, noise = solved(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
+        at, basis, noise = solve_group(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
@@ -78,27 +79,29 @@ class Probe:
         return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * own[:, None]], 1))
 
 
-def summed_gains(
+def likelihood_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
     known: Callable[[Probe, Tensor], Tensor] = Probe.known,
 ) -> Tensor:  # fmt: skip
     """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
-        for chunk in torch.arange(count).split(max(CHUNK // len(probe.group), 1)):
+        for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
             each = waves(probe, chunk)
             size = known(probe, each)
             total[chunk] += torch.stack([probe.gain(each, level, size) for level in levels], 1)
     return total
 
 
-def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: float) -> Tensor | None:
+def find_static_offset(
+    parts: tuple[GroupInBasis, ...], prior: ChannelPrior, wavelength: float
+) -> Tensor | None:
     """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
     direct = prior[Direct]
-    none = prior.changed(replace(direct, power=torch.full_like(direct.power, NONE)))
+    none = prior.changed(replace(direct, power=torch.full_like(direct.power, TINY)))
     probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:
@@ -107,13 +110,13 @@ def best_offset(parts: tuple[Compressed, ...], prior: ChannelPrior, wavelength: 
             return torch.cat([at.waves(probe.group) for at in moved])
 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        return likely + summed_gains(probes, len(offsets), waves, (level,))[:, 0]
+        return likely + likelihood_gains(probes, len(offsets), waves, (level,))[:, 0]
 
-    best, step = torch.zeros(3, dtype=torch.float64), REACH * wavelength / COARSE
+    best, step = ORIGIN, REACH * wavelength / COARSE
     near = torch.arange(-1, 2, dtype=torch.float64)
     coarse = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64)
     for axis in (coarse, *(near / 2**halving for halving in range(1, REFINED + 1))):
         grid = best + step * torch.cartesian_prod(axis, axis, axis)
         best = grid[gain(grid).argmax()]
-    unmoved, best_gain = gain(torch.stack([torch.zeros(3, dtype=torch.float64), best])).tolist()
+    unmoved, best_gain = gain(torch.stack([ORIGIN, best])).tolist()
     return best if math.isfinite(best_gain) and best_gain > unmoved else None

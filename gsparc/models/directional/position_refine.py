@@ -29,7 +29,7 @@ from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import NOISE
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 JITTER_M2 = 1e-14  # [m^2], what float64 needs to factor the covariance of a position
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
@@ -87,7 +87,7 @@ def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
     """Return (K, m, n), of `phase_vectors` (K, m, 3) and (K, n, 3)."""
-    return apart(first, second).square().mul_(-0.5).exp_()
+    return distances(first, second).square().mul_(-0.5).exp_()
 
 
 @dataclass

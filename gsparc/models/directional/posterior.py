@@ -25,8 +25,8 @@ from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.method import to_double
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import apart, matern32_of_squares
-from gsparc.processes.left_out import groups_of, left_out_group
+from gsparc.processes.kernel import distances, matern32_of_squares
+from gsparc.processes.left_out import left_out_group, rows_of_groups
 
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
@@ -50,7 +50,7 @@ class GainKernel:
 
     def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return the correlation (n, m) of places (n, 3) and (m, 3) float64 [m]."""
-        squared = (apart(first, second) / self.length).square()
+        squared = (distances(first, second) / self.length).square()
         return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
 
 
@@ -205,7 +205,7 @@ class SightedSources:
             self._cross(self.unobstructed_waves * at.probability, at.retained, self.power) * at.correlation
         )
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
-        for group in groups_of(self.observer.numpy()):
+        for group in rows_of_groups(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)
             # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
             predicted[group] -= cross[group] @ (inverse[:, group] @ own)

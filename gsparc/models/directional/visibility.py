@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import apart, matern32_of_squares
-from gsparc.processes.left_out import left_out as residuals
+from gsparc.processes.kernel import distances, matern32_of_squares
+from gsparc.processes.left_out import left_out_residuals as residuals
 
 LENGTHS_M = tuple(0.05 * 2.0 ** np.arange(7))  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance
@@ -73,7 +73,9 @@ class VisibilityGP:
     def probability(self, places: Tensor) -> Tensor:
         """Return the probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
         lengths, weights = self._by_length
-        correlation = matern32_of_squares((apart(places, self.places)[:, None] / lengths).square()).flatten(1)
+        correlation = matern32_of_squares(
+            (distances(places, self.places)[:, None] / lengths).square()
+        ).flatten(1)
         return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
 
     @cached_property

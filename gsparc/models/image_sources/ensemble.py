@@ -19,7 +19,7 @@ from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
-from gsparc.processes.worker import Cancelled, after, cancelled_by, late_when
+from gsparc.processes.worker import Cancelled, after_steps, cancelled_by, ending_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ def run_searches(
 
     def ends(share: float) -> Callable[[], bool]:
         """Whether so much of a search's effort, from now, or all of the seconds are spent."""
-        counted = after(round(share * budget.effort.evaluations))
+        counted = after_steps(round(share * budget.effort.evaluations))
         return lambda: counted() or budget.over()
 
     def unwanted(number: int) -> bool:
@@ -107,7 +107,7 @@ def run_searches(
         if unwanted(number) or (number > 0 and budget.over()):
             return None
         try:
-            with cancelled_by(partial(unwanted, number)), late_when(ends(1.0)):
+            with cancelled_by(partial(unwanted, number)), ending_when(ends(1.0)):
                 member = solve(number)
         except Cancelled:
             return None

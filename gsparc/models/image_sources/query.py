@@ -16,7 +16,7 @@ from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.method import to_double
 from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 MATERN32 = 3  # factor of squared distances over lengths in Matern-3/2
@@ -84,7 +84,7 @@ class EnsembleMeans:
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
         """
         dtype = self.towards.dtype
-        squared = apart(queries, self.places).square().to(dtype)
+        squared = distances(queries, self.places).square().to(dtype)
         scaled = torch.addcmul(self.by_angle, squared, self.by_length)
         scaled = torch.baddbmm(scaled, unit_vectors(moving_end(queries), self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene
-from gsparc.processes.worker import late
+from gsparc.processes.worker import out_of_time
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -28,7 +28,7 @@ Cost = Callable[[Scene], Tensor]  # negative log prior [nats] of a scene
 
 
 def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
-    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `late`.
+    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_time`.
 
     Args:
         rows: measurements.
@@ -55,7 +55,7 @@ def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None)
         value, gradient = _objective(rows, scene, values, correlation, cost)
         if value < lowest:
             lowest, best = value, _scene_at(scene, [v.clone() for v in values])
-        if step == steps or late():
+        if step == steps or out_of_time():
             break
         for v, slope in zip(values, gradient, strict=True):
             v.grad = slope
@@ -100,7 +100,7 @@ def _objective(
 def learn_visibility(
     rows: Rows, scene: Scene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
 ) -> Scene:
-    """Fit the visibility kernel by likelihood until `late`, with a log-normal prior about `centre`.
+    """Fit the visibility kernel by likelihood until `out_of_time`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.
@@ -123,7 +123,7 @@ def learn_visibility(
         return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))
 
     for _ in range(steps):
-        if late():
+        if out_of_time():
             break
         posterior = Posterior(rows, current())
         slope, gains = posterior.conditioned.slope, posterior.gains()

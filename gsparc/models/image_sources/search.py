@@ -29,7 +29,7 @@ from gsparc.models.image_sources.rows import LEAST_ROWS, Rows, bounding_box
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import late
+from gsparc.processes.worker import out_of_time
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class SearchSettings(Checked):
 
 
 class Search:
-    """One search over one set of normalised rows (`Frame`); when it is `late`, with what was found so far.
+    """One search over one set of normalised rows (`Frame`); if `out_of_time`, with what was found so far.
 
     Args:
         rows: a few hundred.
@@ -176,7 +176,7 @@ class Search:
         posterior = Posterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for number, parent in enumerate(parents):
-            if number and late():
+            if number and out_of_time():
                 break
             spread = partial(self._spread, parent)
             apart = 0.5 * self.wavelength
@@ -234,7 +234,7 @@ class Search:
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
-        if walls is None or late():
+        if walls is None or out_of_time():
             return
         before = self.scene
         self.scene = orders.reassign_to_walls(before, walls)

@@ -19,8 +19,9 @@ from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import station_site
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.network import network_of
+from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.target_rows import decibels, heard_rows
+from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
@@ -32,6 +33,7 @@ class LearnsTogether(MethodFactory):
     both_ends = True
     takes_budget = True
     init: InitSettings
+    own_terms: tuple[Columns, ...] = ()  # of one station's powers
 
     def shares(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
@@ -42,6 +44,8 @@ class LearnsTogether(MethodFactory):
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
         """See `Method.choose_stations`."""
+        if self.own_terms:
+            return "each", "model.terms are of one station"
         if not self.shares(data.site) or self.init.name == "scene":
             return "each", ""
         return choose_stations(data, fold, context)
@@ -58,7 +62,7 @@ def choose_stations(
     assert data.station is not None
     if data.site.kind == "csi":
         return "together", "channels at all stations share waves and the frame of places"
-    if network_of(data) is not None:
+    if find_sectors(data) is not None:
         return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
     if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
         return "together", "no station of the test rows was heard, and what stations share answers for them"

@@ -24,7 +24,7 @@ from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import FellBehind, Race, mean_square
 from gsparc.training.time_budget import TimeBudget
@@ -80,7 +80,7 @@ def fit_candidates(
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
             within = replace(within, leave_out=leave_out, race=race, beside=fields)
-            with heeded.apart() as read[name], late_when(budget.over):
+            with heeded.apart() as read[name], ending_when(budget.over):
                 clutter = name not in CLUTTERED or effects.visibility is not False
                 field = parts[name](settings, clutter, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)

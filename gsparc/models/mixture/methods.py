@@ -10,8 +10,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate
 from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.powers.own_terms import as_terms
 from gsparc.models.terms import array_obstacle, phase_obstacle
-from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext, FitReport
 
 PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
@@ -67,10 +67,7 @@ class Powers(Mixture):
 
     def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named: Any) -> None:
         super().__init__(*settings, **named)
-        self.own_terms = tuple(terms) if isinstance(terms, Sequence) else (terms,)
-        for one in self.own_terms:
-            if not isinstance(one, Columns):
-                raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
+        self.own_terms = as_terms(terms)
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""

@@ -23,7 +23,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
-from gsparc.models.channels.initial import factors_of_runs
+from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
 from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
@@ -35,7 +35,7 @@ from gsparc.models.refined_places import errors_of, move_rows, refine_places
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
-from gsparc.processes.averages import mixture
+from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -230,7 +230,9 @@ class Mixture(LearnsTogether, ClosedForm):
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
         # Members are in closed form, and state both.
-        mean, variance = mixture([(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs])
+        mean, variance = mixture_moments(
+            [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
+        )
         unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
@@ -242,7 +244,7 @@ class Mixture(LearnsTogether, ClosedForm):
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
         parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]
-        return LeftOutRows(result[0].rows, *mixture(parts))
+        return LeftOutRows(result[0].rows, *mixture_moments(parts))
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -336,6 +338,6 @@ def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFact
     if not RunFactors.several(data, known):
         return RunFactors.none()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
-    result = factors_of_runs(data, known, context.time_budget())
+    result = estimate_run_factors(data, known, context.time_budget())
     log.info("channels of %d runs: the factor of each was estimated by waves of all runs", len(result))
     return result

@@ -22,7 +22,7 @@ from gsparc.models.reduced import Interpolated, Settings, View
 from gsparc.ops.transforms import is_differentiated
 from gsparc.physics.lags import SpectrumLags
 from gsparc.physics.separable import Separable
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 if TYPE_CHECKING:
     from gsparc.models.moving_array.method import MovingArrayField
@@ -94,7 +94,7 @@ class ImageRenderer:
     def __call__(self, where: Tensor) -> ImageAnswers:
         """At places (m, 3) float64 [m]."""
         receivers, centred = (at.to(self._places.dtype) for at in (where, where - self._middle))
-        far = apart(centred, self._places)
+        far = distances(centred, self._places)
         explained = self._array.render(self._trend.sources, receivers, self._trend.powers(far))
         added = self._residual.coefficients(far)
         # In place into fresh images: another copy would be as large as the answer.

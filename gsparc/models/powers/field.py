@@ -20,26 +20,25 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import SceneWalls
-from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_of_file
 from gsparc.models.method import Prediction
-from gsparc.models.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
-from gsparc.models.powers.own_terms import InWorld, learned
-from gsparc.models.powers.settings import LAW_NEEDS, candidates, chosen_among, mixture
+from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
+from gsparc.models.powers.own_terms import UserTerm, describe_weights
+from gsparc.models.powers.settings import LAW_NEEDS, candidate_priors, choose_candidate, mix_candidates
 from gsparc.models.target_rows import entry_variance, from_real, power_rows
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
-from gsparc.processes.posterior import Exact, approximated
-from gsparc.processes.powers import PowerProcess, conditioned, trend_of_rows
+from gsparc.processes.posterior import Exact, approximation_label
+from gsparc.processes.powers import PowerProcess, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Prior
+from gsparc.processes.shared import QUERIES
 from gsparc.processes.stored import restored, stored
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
-
-QUERIES = 512  # at a time: memory
 
 
 class PowerField(ClosedForm):
@@ -87,54 +86,53 @@ class PowerField(ClosedForm):
         self.site, self.fringes = data.site, None
         notes = self._choose(data, rows, budget)
         self.condition(data, rows)
-        own = tuple(one for one in self.trend.more if isinstance(one, InWorld))
+        own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
-            notes = (*notes, *learned(self.powers.posterior, own))
+            notes = (*notes, *describe_weights(self.powers.posterior, own))
         return FitReport(budget.counted.wall, notes, budget.limited_by)
 
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
-        more = tuple(InWorld(one, torch.from_numpy(site.origin)) for one in self.own_terms)
+        more = tuple(UserTerm.of(one, site) for one in self.own_terms)
         for one in more:  # once: a query has no time for it, nor has `torch.func`
             one.check(torch.from_numpy(seen.places))
         if self.walls is not None:
             walls = walls_of_file(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
             told = int((~seen.silent).sum()) >= LAW_NEEDS
-            law, notes = law_of(seen, site) if told else (None, ())
-            trend = replace(trend_of_rows(seen, law), more=(walls, *more))
-            best = chosen_among(seen, [(trend, 0.0, ())], self.seed, chosen_on)
+            law, notes = fit_site_law(seen, site) if told else (None, ())
+            trend = replace(trend_about_rows(seen, law), more=(walls, *more))
+            best = choose_candidate(seen, [(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
             return (note, *notes, *best.notes)
-        found, said = candidates(seen, site, self.seed, chosen_on, more), list[str]()
+        found, said = candidate_priors(seen, site, self.seed, chosen_on, more), list[str]()
         self.priors = ((1.0, found[0].prior),)
         # A level that silent rows are below is no power that waves could be fitted to.
-        if self.waves and not seen.silent.any() and sampled(seen.places, site.wavelength):
+        if self.waves and not seen.silent.any() and resolves_wavelength(seen.places, site.wavelength):
             # `Fringes.rows` is searched by bisection, and must ascend.
             order = np.argsort(rows)
             assert site.wavelength is not None
-            self.fringes, note = find_fringes(
+            self.fringes, note = fit_fringes(
                 seen.at(order), rows[order], found[0].prior, site.wavelength, self.seed, budget
             )
             said.append(note)
             if self.fringes is not None:  # their share was learned beside this process
                 return (found[0].description, *found[0].notes, note)
-        self.priors, notes = mixture(seen, found, self.seed, chosen_on)
+        self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
         return (*notes, *said)
 
     @property
     def trend(self) -> Trend:
         """The mean law of the first prior."""
-        assert self.priors[0][1].trend is not None
-        return self.priors[0][1].trend
+        return self.priors[0][1].known_trend
 
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximated(self.name, None if self.powers is None else self.powers.posterior)
+        return approximation_label(self.name, None if self.powers is None else self.powers.posterior)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -158,8 +156,8 @@ class PowerField(ClosedForm):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
         seen = power_rows(data, rows)
-        own, *others = ((share, conditioned(seen, prior, self.seed)[0]) for share, prior in self.priors)
-        self.powers = replace(own[1], others=tuple(others))
+        each = [(share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors]
+        self.powers = replace(each[0][1], others=tuple(each[1:]))
         # The tree is of the rows before.
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
@@ -200,7 +198,7 @@ class PowerField(ClosedForm):
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
             decibels, factor = self.fringes.blended_unseen(
-                decibels, torch.from_numpy(places), torch.from_numpy(nearest(places)), self.known
+                decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
             )
             spread = spread * factor
         mean = self._power(decibels.float())
@@ -214,15 +212,15 @@ class PowerField(ClosedForm):
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
-            **({} if self.fringes is None else {"fringes": self.fringes.state()}),
+            "fringes": stored(self.fringes),
             "process": stored(self.powers),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.seed = site, int(state["seed"])
-        self.priors, self.powers = restored(state["priors"]), restored(state["process"])
-        self.fringes = fringes_of(state["fringes"]) if "fringes" in state else None
+        parts = (restored(state[name]) for name in ("priors", "process", "fringes"))
+        self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 
     def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:

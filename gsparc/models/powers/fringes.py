@@ -11,18 +11,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.powers.groups import SPREAD, Gain, compared, folds, groups
-from gsparc.models.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_weights
-from gsparc.processes.nearest import Values, given
-from gsparc.processes.powers import Rows, conditioned
+from gsparc.models.powers.groups import SPREAD, ErrorGain, compare_errors, number_squares, split_groups
+from gsparc.models.powers.waves import (
+    FLOOR,
+    PlaneWaveBasis,
+    field_decibels,
+    fit_wave_weights,
+    plane_wave_basis,
+)
+from gsparc.physics.decibels import from_decibels, to_decibels
+from gsparc.processes.density import TINY
+from gsparc.processes.nearest import condition_on_nearest
+from gsparc.processes.places import of_both_ends
+from gsparc.processes.powers import MOST_ROWS as FACTORED
+from gsparc.processes.powers import PowerRows, condition_on_powers
 from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.stored import Stored
+from gsparc.processes.trend import TINY_M
 from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5  # of squares; each solution is blind to one
@@ -30,13 +41,13 @@ SIDES = 8  # squares along the longer side
 BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
-MOST_ROWS = 3_000  # of one least-squares problem per solution
+MOST_ROWS = FACTORED // 2  # of one least-squares problem per solution
 ROWS_PER_WAVE = 6  # two real unknowns each
 BEYOND = (1.0, 2.0)  # wavelengths from all rows between which solutions lose their share
 
 
 @dataclass(frozen=True)
-class Blend:
+class Blend(Stored):
     """How solutions and process share a prediction, by the distance to the nearest row.
 
     Attributes:
@@ -53,7 +64,7 @@ class Blend:
         """Return shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
         # Linear between the two distances that were measured, constant beyond either.
-        there = ((distance - near) / max(far - near, 1e-12)).clamp(0.0, 1.0)
+        there = ((distance - near) / max(far - near, TINY_M)).clamp(0.0, 1.0)
         inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
         left = self.left[0] + (self.left[1] - self.left[0]) * there
@@ -61,7 +72,7 @@ class Blend:
 
 
 @dataclass(frozen=True)
-class Fringes:
+class Fringes(Stored):
     """Solutions, and what they are worth beside a process.
 
     Attributes:
@@ -75,7 +86,7 @@ class Fringes:
         blend: with the process.
     """
 
-    basis: Basis
+    basis: PlaneWaveBasis
     weights: np.ndarray
     blind: np.ndarray
     rows: np.ndarray
@@ -92,7 +103,7 @@ class Fringes:
         """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
-        return self.level + 10 * (field.real.square() + field.imag.square() + FLOOR).log10()
+        return self.level + to_decibels(field.real.square() + field.imag.square() + FLOOR)
 
     def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
@@ -117,39 +128,22 @@ class Fringes:
         share, factor = self.blend.at(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that `fringes_of` needs."""
-        arrays = {name: getattr(self, name) for name in ("weights", "blind", "rows", "fold")}
-        arrays |= {"waves": self.basis.waves, "mixture": self.basis.mixture}
-        blend = [*self.blend.distance, *self.blend.share, *self.blend.left]
-        numbers = {"level": self.level, "wavelength": self.wavelength, "blend": blend}
-        return {**{name: torch.from_numpy(value) for name, value in arrays.items()}, **numbers}
 
-
-def fringes_of(state: dict[str, Any]) -> Fringes:
-    """Return the fringes whose `state()` this was."""
-    arrays = {name: one.numpy() for name, one in state.items() if isinstance(one, Tensor)}
-    basis, b = Basis(arrays.pop("waves"), arrays.pop("mixture")), [float(value) for value in state["blend"]]
-    blend = Blend((b[0], b[1]), (b[2], b[3]), (b[4], b[5]))
-    level, wavelength = float(state["level"]), float(state["wavelength"])
-    return Fringes(basis, level=level, wavelength=wavelength, blend=blend, **arrays)
-
-
-def sampled(places: np.ndarray, wavelength: float | None) -> bool:
+def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
-    if wavelength is None or places.shape[1] != 3:
+    if wavelength is None or of_both_ends(places):
         return False
     unique = np.unique(places, axis=0)
-    return len(unique) > 1 and float(np.median(nearest(unique))) < wavelength / 2
+    return len(unique) > 1 and float(np.median(nearest_distances(unique))) < wavelength / 2
 
 
-def nearest(places: np.ndarray) -> np.ndarray:
+def nearest_distances(places: np.ndarray) -> np.ndarray:
     """Return distances (n,) of places (n, 3) from the nearest other [m]."""
     return cKDTree(places).query(places, k=2)[0][:, 1]
 
 
-def find_fringes(
-    rows: Rows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
+def fit_fringes(
+    rows: PowerRows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
 ) -> tuple[Fringes | None, str]:
     """Return fringes where they pay beside a process, and what must be said of them.
 
@@ -165,28 +159,29 @@ def find_fringes(
     order, probes = rng.permutation(total), total // PROBES
     count = min(total - probes, MOST_ROWS)
     tail = f" (of {count} of {total} rows)" if count < total - probes else ""
-    squares, fold = groups(rows.places, SIDES), np.full(total, -1)
-    parts = folds(squares, FOLDS, seed)
+    squares, fold = number_squares(rows.places, SIDES), np.full(total, -1)
+    parts = split_groups(squares, FOLDS, seed)
     for k, part in enumerate(parts):
         fold[part] = k
     fold[order[:probes]] = -1
     chosen = np.sort(order[: probes + count])
     every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
-    level = 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
-    basis = basis_of(rows.places[fold >= 0], wavelength)
+    level = float(to_decibels(from_decibels(rows.decibels).mean()))
+    basis = plane_wave_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
     error, distance = (one[chosen] for one in _apart(every, [*parts, order[:probes]], plain, seed))
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
-    gain: Gain | None = None
+    gain: ErrorGain | None = None
     while len(weights) < budget.effort.fringes and not budget.over():
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
-            weights.append(fit_weights(columns[seen], rows.decibels[seen] - level, rng))
-        powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
+            weights.append(fit_wave_weights(columns[seen], rows.decibels[seen] - level, rng))
+        blind = np.arange(len(weights)) % FOLDS
+        powers = level + field_decibels(columns @ np.stack(weights, 1))
         blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
@@ -218,22 +213,22 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     return spread * (1 / number - 1 / every)
 
 
-def _apart(rows: Rows, parts: list[np.ndarray], prior: Prior, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _apart(
+    rows: PowerRows, parts: list[np.ndarray], prior: Prior, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n,) of a process at rows of each part without that part, and distances (n,) to the rest [m].
 
     Of all rows, as it will answer: at some of them alone it would seem worse than it is.
     """
     error, distance = np.zeros((2, len(rows.places)))
-    values = torch.from_numpy(rows.decibels)[:, None]
-    dense = given(prior, Values.of(rows.places, values), seed) if len(rows.places) > MOST_ROWS else None
-    at = None if dense is None else dense.near.every.query(rows.places)[1]
+    if many := len(rows.places) > MOST_ROWS:
+        dense = condition_on_nearest(prior, rows.means_at_places(), seed)
+        at = dense.near.every.query(rows.places)[1]
     for part in parts:
-        known: Posterior
-        if dense is None or at is None:
-            rest = np.setdiff1d(np.arange(len(rows.places)), part)
-            known = conditioned(rows.at(rest), prior, seed)[0].posterior
-        else:
-            known = dense.at(np.setdiff1d(at, at[part]), seed)
+        rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)
+        known: Posterior = (
+            dense.at(rest, seed) if many else condition_on_powers(rows.at(rest), prior, seed)[0].posterior
+        )
         places = torch.from_numpy(rows.places[part])
         error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
         distance[part] = known.distance(places).numpy()
@@ -241,9 +236,9 @@ def _apart(rows: Rows, parts: list[np.ndarray], prior: Prior, seed: int) -> tupl
 
 
 def _blend(
-    rows: Rows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
+    rows: PowerRows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
     error: np.ndarray, distance: np.ndarray,
-) -> tuple[Blend, Gain]:  # fmt: skip
+) -> tuple[Blend, ErrorGain]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
     # From the process's prediction, measured plus error, to that of the solutions.
@@ -256,10 +251,10 @@ def _blend(
         # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
-        left.append(both / max(float((error[chosen] ** 2).mean()), 1e-12))
+        left.append(both / max(float((error[chosen] ** 2).mean()), TINY))
     apart = ~probes
     squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
-    gain = compared(squares[apart], error[apart] ** 2, group[apart])
+    gain = compare_errors(squares[apart], error[apart] ** 2, group[apart])
     middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 
@@ -269,7 +264,7 @@ def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, alike: fl
 
     So many rows as are `alike` count as one.
     """
-    noise = alike * max(float((error**2).mean()), 1e-12)
+    noise = alike * max(float((error**2).mean()), TINY)
     square = max(float(towards @ towards - excess.sum()), 0.0)
     # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
     certain = 1 / SPREAD**2

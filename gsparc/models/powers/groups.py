@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsparc.processes.places import moving_end, on_floor
+from gsparc.processes.trend import TINY_M
+
 SIDES = 10  # squares along the longer side of the places' box
 SPREAD = 0.25  # deviation of a prior on what share of a mean a prediction has
 
 
 @dataclass(frozen=True)
-class Gain:
+class ErrorGain:
     """What one prior gains over another at rows left out.
 
     Attributes:
@@ -30,27 +33,26 @@ class Gain:
         return self.squares > errors * self.error
 
 
-def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
+def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
     """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
 
     Along the longer side of the places' box there are `sides` squares.
     """
-    ends = places[:, :3] if places.shape[1] == 6 else places
-    low = ends[:, :2].min(0)
-    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / sides * (1 + 1e-9)
-    cell = np.floor((ends[:, :2] - low) / side).astype(np.int64)
+    floor = on_floor(moving_end(places))
+    side = max(float(np.ptp(floor, axis=0).max()), TINY_M) / sides
+    cell = np.floor((floor - floor.min(0)) / side).clip(max=sides - 1).astype(np.int64)
     return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
+def split_groups(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     """Return `count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
     names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
     parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
     return [part for part in parts if len(part)]
 
 
-def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
+def compare_errors(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> ErrorGain:
     """Return what `one` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
     gain = other - one
     total = np.bincount(group, gain - gain.mean())
-    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))
+    return ErrorGain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))

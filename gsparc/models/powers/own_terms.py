@@ -2,40 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
+from gsparc.data.schema import Site
+from gsparc.processes.places import of_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.term import Columns
 
 
+def as_terms(terms: Any) -> tuple[Columns, ...]:
+    """Return terms (`model.terms`) as a tuple, one alone as of one; `ValueError` for what is none."""
+    result = tuple(terms) if isinstance(terms, Sequence) else (terms,)
+    for one in result:
+        if not isinstance(one, Columns):
+            raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
+    return result
+
+
 @dataclass(frozen=True)
-class InWorld(Columns):
-    """A term that is asked in the coordinates of the measurements.
+class UserTerm(Columns):
+    """A term that is asked of both ends in the coordinates of the measurements.
 
     Attributes:
         term: of a user.
         origin: (3,) of local coordinates [m].
+        still: (3,) the end that stands, local [m]; NaN where unknown, or where both move.
     """
 
     term: Columns
     origin: Tensor
+    still: Tensor
+
+    @classmethod
+    def of(cls, term: Columns, site: Site) -> UserTerm:
+        """Return a term of a site of one station, or of ends that both move."""
+        still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
+        return cls(term, *(torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)))
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Columns`; of places in local coordinates."""
-        # Places are of one end (n, 3), or of both (n, 6).
-        return self.term.columns(places + self.origin.repeat(places.shape[1] // 3))
+        """See `Columns`; of places of the moving end (n, 3), or of both (n, 6), in local coordinates."""
+        both = places if of_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
+        return self.term.columns(both + torch.cat([self.origin, self.origin]))
 
     def check(self, places: Tensor) -> None:
         """Raise `ValueError` where columns at places (n, D) [m] have another shape or are not finite."""
         result = self.columns(places)
         if result.ndim != 2 or len(result) != len(places) or not result.isfinite().all():
-            name, shape = type(self.term).__name__, (*result.shape,)
-            raise ValueError(f"{name}.columns gave {shape}; ({len(places)}, Q) finite numbers are needed")
+            gave = f"{type(self.term).__name__}.columns gave {(*result.shape,)}"
+            unknown = not of_both_ends(places) and not self.still.isfinite().all()
+            why = ", but the place of the end that stands is not given" if unknown else ""
+            raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed{why}")
 
 
-def learned(posterior: Exact, own: tuple[InWorld, ...]) -> list[str]:
+def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[str]:
     """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
     at = posterior.rows
     columns = posterior.prior.columns(at)

@@ -16,21 +16,21 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.models.baselines.distance_law import law_of
+from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
-from gsparc.models.powers.groups import groups
-from gsparc.processes.censored import ConditionalGaussian, Sites
-from gsparc.processes.density import Evidence, by_left_out, gram_of, walked
-from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, apart
-from gsparc.processes.left_out import groups_of, left_out
-from gsparc.processes.nearest import Values, given, settings_of
+from gsparc.models.powers.groups import SIDES, number_squares
+from gsparc.processes.censored import ConditionalGaussian, PseudoValues
+from gsparc.processes.density import LOOKS, Evidence, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
+from gsparc.processes.left_out import left_out_residuals, rows_of_groups
+from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, Rows, conditioned, trend_of_rows
+from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import late
+from gsparc.processes.worker import out_of_time
 from gsparc.training.time_budget import Effort
 
 MeanName = Literal["auto", "constant", "distance"]
@@ -47,15 +47,15 @@ TWO_LENGTHS_NEED = 100  # rows that were heard; for a mixture too: of fewer no s
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
-SIDES = (10, 5)  # squares along the longer side that are left out
-LOOKS, REFINED, SETTLED = 40, 8, 5e-6  # most looks, and those at all rows after such at few
+SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
+REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
 LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
-def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0
+def fit_power_process(
+    rows: PowerRows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -67,8 +67,8 @@ def fit_powers(
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
     """
-    best = chosen_among(rows, _trends(rows, site, mean), seed, CHOSEN_ON)
-    process, more = conditioned(rows, best.prior, seed)
+    best = choose_candidate(rows, _trends(rows, site, mean), seed, CHOSEN_ON)
+    process, more = condition_on_powers(rows, best.prior, seed)
     return process, (best.description, *best.notes, *more)
 
 
@@ -100,8 +100,8 @@ class Candidate:
         return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
 
 
-def candidates(
-    rows: Rows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
+def candidate_priors(
+    rows: PowerRows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
 ) -> list[Candidate]:
     """Return the likeliest settings of each mean law, the best first, then those of kriging.
 
@@ -110,21 +110,23 @@ def candidates(
     laws = _trends(rows, site, "auto")
     trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
-        return [chosen_among(rows, trends, seed, chosen_on)]
-    found = sorted((chosen_among(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score)
+        return [choose_candidate(rows, trends, seed, chosen_on)]
+    found = sorted(
+        (choose_candidate(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score
+    )
     return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
 
 
-def _kriged(rows: Rows, trend: Trend) -> Candidate:
+def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    found = fit_variogram(rows.places, _views(rows, trend)[2].numpy())
+    found = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
     sill = max(found.sill, LEAST_SILL * found.total)
     kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
 
 
-def mixture(
-    rows: Rows, found: list[Candidate], seed: int, chosen_on: int
+def mix_candidates(
+    rows: PowerRows, found: list[Candidate], seed: int, chosen_on: int
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
@@ -134,11 +136,11 @@ def mixture(
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
     part = rows.drawn(chosen_on, seed)
-    posteriors = [conditioned(part, one.prior, seed)[0].posterior for one in found]
+    posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in found]
     # Of all rows: drawn ones are farther apart than those that will answer.
     gram = _relative([_among_rows(rows.loud, one.prior, seed) for one in found])
-    for sides in SIDES:
-        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SIDES)
+    for sides in SPANS:
+        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
@@ -156,50 +158,49 @@ def _relative(errors: list[np.ndarray]) -> np.ndarray:
 def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
     """Errors (n,) [dB] of rows that were heard, each predicted without those of its square of floor."""
     assert isinstance(posterior, Exact)
-    group = groups_of(groups(posterior.rows.numpy(), sides))
-    residual, _ = left_out(posterior.factor.inverse, posterior.weights, group)
+    group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
+    residual, _ = left_out_residuals(posterior.factor.inverse, posterior.weights, group)
     return residual[posterior.extra == 0, 0].numpy()
 
 
-def _among_rows(loud: Rows, prior: Prior, seed: int) -> np.ndarray:
+def _among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     """Errors (n,) [dB] at each place, predicted from the nearest others."""
-    values = Values.of(loud.places, torch.from_numpy(loud.decibels)[:, None])
-    return (values.values - given(prior, values, seed).left_out()[0])[:, 0].numpy()
+    values = loud.means_at_places()
+    return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
-def chosen_among(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
+def choose_candidate(
+    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
     if not many:
         return best
-    values = Values.of(rows.places, torch.from_numpy(rows.decibels)[:, None])  # given their nearest, all tell
-    kernel, how = settings_of(best.prior, values, seed)
+    kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
+    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = (rows if rows.silent.all() else rows.loud).drawn(chosen_on, seed)
+    loud = rows.heard.drawn(chosen_on, seed)
     few = loud.drawn(COMPARED_ON, seed)
     weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     scores = [one.score for one in candidates]
-    if both and not late():
+    if both and not out_of_time():
         weighed = _in_doubt(weighed, candidates[-1])
         scores = [_weighed(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
-    if len(few.places) >= TWO_LENGTHS_NEED and not late():
+    if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
         best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not late():
+    if len(loud.places) > len(few.places) and not out_of_time():
         # A look at all rows costs several at few: what was found on these is near already.
         best = _searched(loud, best, [best.kernel], looks=REFINED)
-    if both and not late():  # one walk: each look factors several covariances
+    if both and not out_of_time():  # one walk: each look factors several covariances
         best = _weighed(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
@@ -208,65 +209,52 @@ def _settings(
     return best
 
 
-def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, float, tuple[str, ...]]]:
+def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, float, tuple[str, ...]]]:
     """Candidate means, their cost, and notes.
 
     The cost is the number of parameters that the covariance leaves out, less the prior odds of a
     law: near the rows both predict alike, and far from them powers fall.
     """
-    constant: tuple[Trend, float, tuple[str, ...]] = (trend_of_rows(rows, None), 0.0, ())
+    constant: tuple[Trend, float, tuple[str, ...]] = (trend_about_rows(rows, None), 0.0, ())
     if mean == "constant" or (mean == "auto" and int((~rows.silent).sum()) < LAW_NEEDS):
         return [constant]
-    law, notes = law_of(rows, site)
-    trend = trend_of_rows(rows, law)
+    law, notes = fit_site_law(rows, site)
+    trend = trend_about_rows(rows, law)
     odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
     by_distance = trend, 4 if notes else 1 - odds, notes  # its floor, and a place that was sought
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
-def _views(rows: Rows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances (n, n) [m], terms (n, P) and values less the mean (n, 1) [dB]."""
-    places = torch.from_numpy(rows.places)
-    values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.columns(places), values[:, None]
-
-
-def _by_left_out(
-    starts: list[Kernel], distance: Tensor, terms: Tensor, values: Tensor, looks: int = LOOKS
-) -> tuple[float, Kernel]:
-    return by_left_out(starts, distance, terms, values, starts[0].bounds(distance), looks, SETTLED)
-
-
-def _one_length(rows: Rows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = _views(rows, trend)
+def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
+    distance, terms, values = rows.regression_about(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
         return Candidate(0.0, trend, Kernel.of_one(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.of_one(scale * share, 0.1) for share in SHARES]
-    value, kernel = _by_left_out(starts, distance, terms, values)
+    value, kernel = fit_kernel_by_left_out(starts, distance, terms, values)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
 def _searched(
-    rows: Rows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
+    rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = _by_left_out(starts, *_views(rows, one.trend), looks)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_about(one.trend), looks=looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
-def _pairs(rows: Rows, one: Kernel) -> list[Kernel]:
+def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
-    scale = float(np.median(apart(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    scale = float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
     near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
     return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
-def _in_doubt(rows: Rows, one: Candidate) -> Rows:
+def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = _views(rows, one.trend)
-    gram = one.kernel.amplitude * gram_of(one.kernel, distance, terms)
+    distance, terms, values = rows.regression_about(one.trend)
+    gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
     known = ConditionalGaussian.of(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.doubt(values[silent, 0])
@@ -275,23 +263,23 @@ def _in_doubt(rows: Rows, one: Candidate) -> Rows:
     return rows.at(np.flatnonzero(used))
 
 
-def _weighed(rows: Rows, one: Candidate, looks: int) -> Candidate:
+def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = _views(rows, one.trend)
+    distance, terms, values = rows.regression_about(one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = one.kernel.bounds(distance)
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
-    last: list[Sites] = []
+    last: list[PseudoValues] = []
 
     def objective(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * gram_of(one.kernel.at(at[:-1]), distance, terms)
+        gram = at[-1].exp() * covariance_of(one.kernel.at(at[:-1]), distance, terms)
         return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
     best, value = start, float(objective(torch.from_numpy(start)))
     if looks:
-        best, value = walked(objective, [start], bounds, looks, EVIDENCE_SETTLED)
+        best, value = minimise(objective, [start], bounds, looks, EVIDENCE_SETTLED)
     kernel = replace(one.kernel.at(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)

@@ -14,8 +14,10 @@ import numpy as np
 import torch
 from scipy.linalg import blas, eigh
 
-from gsparc.models.channels.kernels import sphere
+from gsparc.models.channels.kernels import fibonacci_sphere
+from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.stored import Stored
 
 WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
 KEPT = 1e-3  # eigenvalues kept, of the largest
@@ -24,13 +26,14 @@ SCALE_DB = 2.0  # of the errors at first
 LEAST_DB = 0.5
 ALIKE = 3.0  # rows that err together, as neighbours do: each counts a third
 FLOOR = 3e-4  # power that no interference takes away, of the mean power
-STAGES = ((0.1, 8), (0.03, 8), (0.01, 8), (0.003, 8), (0.0, 16))  # power added to hide nulls at first, steps
+HIDDEN = (0.1, 0.03, 0.01, 0.003, 0.0)  # powers added to hide nulls at first, one stage after the other
+STEPS = 8  # of a stage, twice as many of the last
+DAMPED = 4.0  # factor of the damping after a step that was none
 TRIES, SETTLED = 4, 1e-4
-DECIBEL = 20 / math.log(10)
 
 
 @dataclass(frozen=True)
-class Basis:
+class PlaneWaveBasis(Stored):
     """Coherent fields of unit mean power at the places that they were made for.
 
     Attributes:
@@ -50,25 +53,25 @@ class Basis:
         return self.plane(places) @ self.mixture
 
 
-def basis_of(places: np.ndarray, wavelength: float) -> Basis:
+def plane_wave_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
     """Return combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
 
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
     """
-    waves = 2 * math.pi / wavelength * sphere(WAVES).numpy()
-    plane = Basis(waves, np.eye(WAVES)).plane(places)
+    waves = 2 * math.pi / wavelength * fibonacci_sphere(WAVES).numpy()
+    plane = PlaneWaveBasis(waves, np.eye(WAVES)).plane(places)
     # One triangle of a Hermitian product: half the multiplications of all of it.
     values, vectors = eigh(blas.zherk(1 / len(places), plane, trans=2), lower=False)
     large = values > KEPT * values[-1]
-    return Basis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
+    return PlaneWaveBasis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
 
 
-def decibels_of(field: np.ndarray) -> np.ndarray:
+def field_decibels(field: np.ndarray) -> np.ndarray:
     """Return powers [dB] of complex fields of any shape, with the floor."""
-    return 10 * np.log10(np.abs(field) ** 2 + FLOOR)
+    return to_decibels(np.abs(field) ** 2 + FLOOR)
 
 
-def fit_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def fit_wave_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
 
     A weight's prior is complex normal of variance 1.
@@ -77,11 +80,11 @@ def fit_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Genera
     weights: np.ndarray = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / math.sqrt(2)
     weights /= math.sqrt(float((np.abs(columns @ weights) ** 2).mean()))
     scale, damping = SCALE_DB, 1e-2
-    for hidden, steps in STAGES:
+    for hidden in HIDDEN:
         now = _Misfit.of(columns, decibels, weights, hidden, scale)
         scale = now.scale()
         now = _Misfit.of(columns, decibels, weights, hidden, scale)
-        for _ in range(steps):
+        for _ in range(STEPS if hidden else 2 * STEPS):
             result = _step(columns, single, decibels, now, hidden, scale, damping)
             if result is None:
                 break
@@ -109,7 +112,7 @@ class _Misfit:
     ) -> _Misfit:
         field = columns @ weights
         power = np.abs(field) ** 2 + FLOOR + hidden
-        error = 10 * np.log10(power) - decibels
+        error = to_decibels(power) - decibels
         value = 0.5 * (DEGREES + 1) * float(np.log1p(error**2 / (DEGREES * scale**2)).sum())
         return cls(weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum()))
 
@@ -129,7 +132,7 @@ def _step(
     """A better place and the next damping; None where none was found."""
     count = columns.shape[1]
     # Single precision: a step need not be exact, its worth is judged in double.
-    slope = (DECIBEL * now.field.conj() / now.power).astype(np.complex64)[:, None] * single
+    slope = (2 * RELATIVE_DB * now.field.conj() / now.power).astype(np.complex64)[:, None] * single
     jacobian = np.concatenate([slope.real, -slope.imag], 1)
     share = ((DEGREES + 1) / (DEGREES * scale**2 + now.error**2)).astype(np.float32)
     normal = ((jacobian.T * share) @ jacobian).astype(np.float64)
@@ -143,11 +146,11 @@ def _step(
         try:
             factor = Factor.of(torch.from_numpy(damped), "raise")
         except NotPositiveDefiniteError:  # rounding: more damping mends it
-            damping *= 4
+            damping *= DAMPED
             continue
         by = -factor.solved(torch.from_numpy(right)[:, None])[:, 0].numpy()
         better = _Misfit.of(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
         if better.value < now.value:
             return better, max(damping / 3, 1e-5)
-        damping *= 4
+        damping *= DAMPED
     return None

@@ -22,15 +22,15 @@ from gsparc.field.encoding import Prior
 from gsparc.field.initial import InitTask, Start, keep_weights
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_array_vectors
-from gsparc.models.baselines.gp import choose_kernel, principal_components
+from gsparc.models.baselines.gp import choose_kernel_by_left_out, principal_components
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
-from gsparc.processes.features import Whitened, whitened
+from gsparc.processes.features import Features, whitened_features
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.left_out import left_out
+from gsparc.processes.left_out import left_out_residuals
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
 CHUNK = 256  # images held as floats at a time
@@ -57,7 +57,7 @@ class Process:
     """
 
     prior: Prior
-    features: Whitened
+    features: Features
 
 
 def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
@@ -65,7 +65,7 @@ def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int)
     _, kernel = _kernel(data, rows, anchors, seed)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
-    features = whitened(places, kernel.length, noise, "matern32", anchors)
+    features = whitened_features(places, kernel.length, noise, "matern32", anchors)
     prior = Prior(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
     return Process(prior, features)
 
@@ -76,7 +76,7 @@ def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple
     chosen = rows if len(rows) <= most else np.sort(draw.choice(rows, most, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
-    return chosen, choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
+    return chosen, choose_kernel_by_left_out(data.moving[looked_at], parts.scores, len(parts.mean))
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def solve_emissions(
     first = parts[0]
     own = rows[: len(first.outputs)]
     places = torch.from_numpy(data.moving[own]).float().double()
-    features = whitened(places, process.prior.length, process.prior.noise, "matern32", len(own))
+    features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(own))
     inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
         model.error.set(*_errors(first, inverse, process.prior.noise, mean))
@@ -167,7 +167,7 @@ def _errors(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -
 
     Rasmussen and Williams (2006), eq. 5.12.
     """
-    residual, variance = left_out(inverse, inverse @ (seen.outputs - mean))
+    residual, variance = left_out_residuals(inverse, inverse @ (seen.outputs - mean))
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])

@@ -19,7 +19,7 @@ from gsparc.field.response import ArrayResponse
 from gsparc.models.method import Method
 from gsparc.models.reduced import Interpolated, Settings, coarsen_grid
 from gsparc.ops import Pose, SphereGrid
-from gsparc.processes.features import correlation, pivoted_rows, with_places
+from gsparc.processes.features import correlation, features_at_places, pivoted_rows
 
 if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
@@ -116,7 +116,7 @@ def distil_features(model: GaussianModel, share: float) -> None:
     count, width, channels = emission.weight2.shape
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
     chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
-    features = with_places(places[chosen], places, length, noise, old.kernel)
+    features = features_at_places(places[chosen], places, length, noise, old.kernel)
     result = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)

@@ -19,27 +19,27 @@ from gsparc.models.baselines.distance_law import (
     VARIANCE,
     DistanceLaw,
     Law,
-    Rows,
     fit_law,
     law_variance,
-    log_below,
-    misfit,
-    seek_place,
+    likelihood_slopes,
+    locate_still_end,
+    log_probability_below,
 )
+from gsparc.processes.powers import PowerRows
 from gsparc.training.context import FitContext
 
 STILL = np.array([3.0, -8.0, 6.0])
 
 
-def rows_of(count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0) -> Rows:
+def rows_of(count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0) -> PowerRows:
     rng = np.random.default_rng(0)
     places = np.c_[rng.uniform(-40, 40, (count, 2)), np.full(count, 1.5)]
     far = np.maximum(np.linalg.norm(places - STILL, axis=1), floor)
     decibels = -40 - 10 * exponent * np.log10(far) + noise * rng.standard_normal(count)
-    return Rows(places, decibels, np.zeros(count, bool))
+    return PowerRows(places, decibels, np.zeros(count, bool))
 
 
-def data_of(rows: Rows, **more: np.ndarray) -> Measurements:
+def data_of(rows: PowerRows, **more: np.ndarray) -> Measurements:
     arrays = {"rx_position": rows.places, "tx_position": STILL, "rssi_db": rows.decibels}
     return from_arrays({**arrays, **more}, {"name": "law"})
 
@@ -82,7 +82,7 @@ def test_all_rows_at_one_place():
 
 def test_the_density_has_mass_one_and_its_variance():
     def density(z: float) -> float:
-        return float(np.exp(-misfit(np.array([z]), np.array([False]), 1.0)[0]))
+        return float(np.exp(-likelihood_slopes(np.array([z]), np.array([False]), 1.0)[0]))
 
     ends = [-40, -3, 3, 40]
     for power, expected in ((0, 1.0), (2, VARIANCE)):
@@ -90,24 +90,24 @@ def test_the_density_has_mass_one_and_its_variance():
         assert sum(parts) == pytest.approx(expected, rel=1e-6)
     for z in (-7.0, -3.0, -1.0, 0.5, 3.0, 5.0):
         below = sum(quad(density, a, min(b, z))[0] for a, b in pairwise(ends) if a < z)
-        assert log_below(np.array([z]))[0] == pytest.approx(np.log(below), abs=1e-6)
-    assert MASS > 0 and np.isfinite(log_below(np.array([-1e9, 1e9]))).all()
+        assert log_probability_below(np.array([z]))[0] == pytest.approx(np.log(below), abs=1e-6)
+    assert MASS > 0 and np.isfinite(log_probability_below(np.array([-1e9, 1e9]))).all()
 
 
 def test_slopes_of_the_misfit():
     rng = np.random.default_rng(1)
     residual, side = 6 * rng.standard_normal(40), rng.integers(-1, 2, 40)
-    _, slope, by_scale = misfit(residual, side, 2.0)
+    _, slope, by_scale = likelihood_slopes(residual, side, 2.0)
     step = 1e-5 * rng.standard_normal(40)
-    ends = [misfit(residual + sign * step, side, 2.0)[0] for sign in (-0.5, 0.5)]
+    ends = [likelihood_slopes(residual + sign * step, side, 2.0)[0] for sign in (-0.5, 0.5)]
     assert slope @ step == pytest.approx(ends[1] - ends[0], rel=1e-4)
-    ends = [misfit(residual, side, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
+    ends = [likelihood_slopes(residual, side, 2.0 * np.exp(sign * 1e-5))[0] for sign in (-0.5, 0.5)]
     assert by_scale == pytest.approx((ends[1] - ends[0]) / 1e-5, rel=1e-4)
 
 
 def test_a_place_nobody_gave_is_estimated_and_said():
     rows = rows_of(noise=1.0)
-    place = seek_place(rows)
+    place = locate_still_end(rows)
     assert np.linalg.norm(place[:2] - STILL[:2]) < 3.0
     data = data_of(rows)
     unknown = replace(data, site=replace(data.site, static_position=None))
@@ -123,7 +123,7 @@ def test_both_ends_move():
     rng = np.random.default_rng(0)
     ends = rng.uniform(-30, 30, (200, 6))
     far = np.linalg.norm(ends[:, :3] - ends[:, 3:], axis=1)
-    law = fit_law(Rows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None)
+    law = fit_law(PowerRows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None)
     assert law.place is None and law.exponent == pytest.approx(2.2, abs=0.15)
     mean = law.mean(torch.from_numpy(ends)).numpy()
     assert np.allclose(mean, law.mean(torch.from_numpy(ends[:, [3, 4, 5, 0, 1, 2]])).numpy())

@@ -11,8 +11,8 @@ from scenes import answer_error, fold_of
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
-from gsparc.models.channels.columns import gather
-from gsparc.models.channels.evidence import compressed, normalised
+from gsparc.models.channels.columns import group_channels
+from gsparc.models.channels.evidence import compress_groups, normalise_power
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.mirrors import find_mirrors
@@ -57,7 +57,7 @@ def _data(end, place, channel, carrier=299792458.0 / WAVELENGTH):
 
 def _bare(data):
     """Groups, and a direct wave in a diffuse field."""
-    groups = tuple(normalised(group) for group in gather(data, np.arange(len(data)), True))
+    groups = tuple(normalise_power(group) for group in group_channels(data, np.arange(len(data)), True))
     frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 2.0, 0.8, torch.zeros(3).double())
     power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
     terms = Isotropic(frame, power[:1]), Direct(frame, power[1:3]), Noise(frame, power[3:])
@@ -67,7 +67,7 @@ def _bare(data):
 def test_a_probe_gains_what_the_likelihood_rises():
     groups, prior = _bare(_data(*_site([WALL], ends=1)))
     group, level = groups[0], 0.2
-    probe = Probe.of(compressed(groups, prior)[0], prior)
+    probe = Probe.of(compress_groups(groups, prior)[0], prior)
     covariance = prior.of_groups(groups)[0] + prior.disturbance(group)
     waves = torch.randn(2, len(group), dtype=torch.complex128, generator=torch.manual_seed(0))
     for _ in range(2):  # alone, then beside the first
@@ -86,7 +86,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
     data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
     groups, prior = _bare(data)
-    parts = compressed(groups, prior)
+    parts = compress_groups(groups, prior)
     planes = find_mirrors(parts, parts, prior, WAVELENGTH, 1)
     plane = planes[0].numpy() * np.sign(planes[0, 0].item())
     assert np.arccos(plane[:3] @ WALL[:3]) < 0.05

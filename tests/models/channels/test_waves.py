@@ -14,16 +14,21 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
-from gsparc.models.channels.columns import At, bands, gather
+from gsparc.models.channels.columns import SlotPlaces, coherent_bands, group_channels
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
-from gsparc.models.channels.kernels import cells, directed, directions, sphere
+from gsparc.models.channels.kernels import (
+    bisected_cells,
+    directional_correlation,
+    fibonacci_sphere,
+    spread_directions,
+)
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.ops import Pose
-from gsparc.processes.left_out import groups_of
+from gsparc.processes.left_out import rows_of_groups
 from gsparc.training.context import FitContext
 
 PLAIN = ChannelSettings(constant=False, direct=False, directions=False, correlated=False)
@@ -37,7 +42,7 @@ def _sent(count=90, *, seed=0, direct=1.0, leakage=0.5, diffuse=0.0, noise=0.05,
     place = np.c_[rng.uniform(0, side, (count, 2)), np.full(count, 0.2)]
     away = np.linalg.norm(place - end, axis=1)
     h = direct * np.exp(-1j * K * away) / away + leakage * np.exp(0.7j)
-    waves = sphere(200).numpy()
+    waves = fibonacci_sphere(200).numpy()
     gains = rng.standard_normal((200, 2)) @ [1, 1j] * diffuse / 20
     h = h + np.exp(1j * K * place @ waves.T) @ gains
     h = h + noise * rng.standard_normal((count, 2)) @ [1, 1j] / 2**0.5
@@ -56,7 +61,7 @@ def _prior(data, *, correlated=False, mirrors=1, angles=4, envelope=0.4):
     isotropic, unequal, leakage, direct, images, noise, drift = power.split(sizes)
     return ChannelPrior(()).changed(
         Isotropic(frame, isotropic),
-        Directions(frame, unequal, angles=sphere(angles), concentration=5.0),
+        Directions(frame, unequal, angles=fibonacci_sphere(angles), concentration=5.0),
         Leakage(frame, leakage),
         Direct(frame, direct),
         Images(frame, images, planes=planes),
@@ -100,28 +105,30 @@ def test_isotropic_term_alone_is_the_plain_process():
 def test_one_direction_is_the_mean_of_plane_waves_and_all_are_the_isotropic_field():
     step = torch.randn(200, 3, dtype=torch.float64) * 0.2
     distance = step.norm(dim=1)
-    found = torch.stack([directed((K * distance) ** 2, K * step @ u, 8.0) for u in sphere(96)]).mean(0)
+    found = torch.stack(
+        [directional_correlation((K * distance) ** 2, K * step @ u, 8.0) for u in fibonacci_sphere(96)]
+    ).mean(0)
     torch.testing.assert_close(found.real, torch.sinc(distance * K / np.pi), atol=2e-3, rtol=0)
     assert found.imag.abs().max() < 2e-3
     direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    step, waves = torch.randn(50, 3, dtype=torch.float64) * 0.1, sphere(40_000)
+    step, waves = torch.randn(50, 3, dtype=torch.float64) * 0.1, fibonacci_sphere(40_000)
     weight = torch.softmax(6.0 * waves @ direction, 0)
     expected = torch.polar(torch.ones(()).double(), K * step @ waves.T) @ weight.to(torch.complex128)
-    found = directed((K * step.norm(dim=1)) ** 2, K * step @ direction, 6.0)
+    found = directional_correlation((K * step.norm(dim=1)) ** 2, K * step @ direction, 6.0)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 
 def test_flat_places_get_a_half_sphere():
     flat = torch.from_numpy(_sent().moving)
-    half = directions(flat, K, 12)
+    half = spread_directions(flat, K, 12)
     assert len(half) == 12 and abs(half[:, 2].sign().sum()) == 12
-    assert abs(directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum()) < 12
+    assert abs(spread_directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum()) < 12
 
 
 def test_covariance_is_hermitian_and_its_diagonal_the_prior():
     data = _sent(60)
     field = _whole(data, correlated=True)
-    group = gather(data, np.arange(40), True)[0]
+    group = group_channels(data, np.arange(40), True)[0]
     (signal,) = field.prior.of_groups([group])
     torch.testing.assert_close(signal, signal.mH)
     torch.testing.assert_close(signal.diagonal().real, field.prior.variance(group))
@@ -131,15 +138,15 @@ def test_covariance_is_hermitian_and_its_diagonal_the_prior():
 def test_slopes_of_the_evidence_and_what_compression_costs():
     data = _sent(120, diffuse=1.0, side=0.3)
     prior = _prior(data, envelope=2.0)
-    groups = tuple(map(evidence.normalised, gather(data, np.arange(120), True)))
-    part = evidence.compressed(groups, prior)[0]
+    groups = tuple(map(evidence.normalise_power, group_channels(data, np.arange(120), True)))
+    part = evidence.compress_groups(groups, prior)[0]
     power = part.own(prior)
     assert part.basis.shape[1] < 80
-    at = evidence.solved(part, power)
-    slope = evidence.slope(part, power, at)
+    at = evidence.solve_group(part, power)
+    slope = evidence.power_gradient(part, power, at)
     for number in range(len(power)):
         found = [
-            evidence.solved(part, power * torch.exp(step * torch.eye(len(power)).double()[number])).nll
+            evidence.solve_group(part, power * torch.exp(step * torch.eye(len(power)).double()[number])).nll
             for step in (1e-5, -1e-5)
         ]
         assert float(slope[number]) == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4)
@@ -148,8 +155,8 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
     fit = (group.target.conj() * torch.linalg.solve(whole, group.target)).real.mean()
     expected = float(len(group) * fit.log() + torch.logdet(whole).real)
     assert at.nll == pytest.approx(expected, abs=1.0)
-    cell = cells(group.places.numpy(), 3)
-    (error,), inverse = evidence.left_out(part, power, [groups_of(cell)]), torch.linalg.inv(whole)
+    cell = bisected_cells(group.places.numpy(), 3)
+    (error,), inverse = evidence.left_out_errors(part, power, [rows_of_groups(cell)]), torch.linalg.inv(whole)
     mine = torch.from_numpy(np.flatnonzero(cell == 2))
     own = torch.linalg.solve(inverse[mine[:, None], mine], (inverse @ group.target)[mine])
     assert (error[mine] - own).abs().max() < 0.03 * own.abs().max()
@@ -171,11 +178,11 @@ def test_a_term_that_says_its_covariance_alone_is_learned_and_answers():
     data = replace(data, target=data.target + 30 * data.moving[:, :1, None].astype(np.complex64))
     zero, one = torch.zeros(3).double(), torch.ones(1).double()
     frame = Frame(zero, 20.0, 0.2, 0.3, zero)
-    groups = tuple(map(evidence.normalised, gather(data, np.arange(40), False)))
+    groups = tuple(map(evidence.normalise_power, group_channels(data, np.arange(40), False)))
     errors = []
     for more in ((), (_Tilt(frame, 0.2 * one),)):
         prior = ChannelPrior((Isotropic(frame, one), *more, Noise(frame, 0.01 * one)))
-        prior, _ = evidence.fit_powers(evidence.compressed(groups, prior), prior, 0.0)
+        prior, _ = evidence.fit_powers(evidence.compress_groups(groups, prior), prior, 0.0)
         errors.append(answer_error(conditioned(prior, data, np.arange(40)), data, np.arange(40, 60)))
     assert errors[1] < 0.5 * errors[0]
     assert prior[_Tilt].power > 10 * prior[Isotropic].power
@@ -208,7 +215,7 @@ def test_far_away_nothing_is_known():
     assert found.unknown.item() > 0.999 and found.mean.abs().max() < 1e-3
     known = field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
-    expected = field.prior.variance(At(known.group.slot, place)) + field.prior.noise
+    expected = field.prior.variance(SlotPlaces(known.group.slot, place)) + field.prior.noise
     assert found.variance.item() == pytest.approx(known.scale * expected.item(), rel=1e-3)
 
 
@@ -221,7 +228,7 @@ def test_variances_have_the_digits_they_need(noise, plain):
     if plain:
         prior = prior.changed(replace(prior[Direct], power=torch.zeros(0).double()))
     (known,) = conditioned(prior, data, np.arange(40)).weights
-    here = At(known.group.slot, torch.from_numpy(data.moving[30:50]).double())
+    here = SlotPlaces(known.group.slot, torch.from_numpy(data.moving[30:50]).double())
     cross = _signal(prior, here, known.group)
     white = torch.linalg.solve_triangular(known.given.factor.lower, cross.mH, upper=False)
     exact = white.abs().square().sum(0)
@@ -231,9 +238,9 @@ def test_variances_have_the_digits_they_need(noise, plain):
 
 def test_directions_in_blocks_are_those_at_once(monkeypatch):
     data = _sent(60)
-    (group,), term = gather(data, np.arange(40), True), _prior(data)[Directions]
+    (group,), term = group_channels(data, np.arange(40), True), _prior(data)[Directions]
     whole = term.covariance(group, group)
-    monkeypatch.setattr("gsparc.models.channels.terms.directions.BLOCK", 1)
+    monkeypatch.setattr("gsparc.models.channels.terms.directions.ENTRIES", 1)
     torch.testing.assert_close(term.covariance(group, group), whole)
 
 
@@ -318,8 +325,8 @@ def test_channels_of_two_rows_were_divided_by_no_row(count):
 
 def test_tones_far_apart_are_bands_of_their_own():
     tones = 2.4e9 + 1e6 * np.arange(40)
-    found = bands(tones, 10.0)
-    assert len(bands(tones, 0.1)) == 1 and len(found) > 4
+    found = coherent_bands(tones, 10.0)
+    assert len(coherent_bands(tones, 0.1)) == 1 and len(found) > 4
     assert sorted(sum(found, ())) == list(range(40))
 
 

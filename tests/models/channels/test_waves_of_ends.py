@@ -11,11 +11,11 @@ from scenes import answer_error, fold_of
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import At, Slot
+from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
-from gsparc.models.channels.kernels import sphere
+from gsparc.models.channels.kernels import fibonacci_sphere
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.term import Frame
@@ -35,7 +35,7 @@ def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), run
     rng = np.random.default_rng(seed)
     place = np.c_[rng.uniform(0, 0.7, (count, 2)), np.full(count, 0.2)]
     end = np.c_[rng.uniform(-1, 2, (ends, 2)), np.full(ends, 1.8)]
-    waves, channel = sphere(150).numpy(), np.empty((count, ends), complex)
+    waves, channel = fibonacci_sphere(150).numpy(), np.empty((count, ends), complex)
     for number, true in enumerate(end + shift):
         away = np.linalg.norm(place - true, axis=1)
         towards = (true - place.mean(0)) / np.linalg.norm(true - place.mean(0))
@@ -58,7 +58,7 @@ def _tied(data, rows):
     towards = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
     prior = ChannelPrior(()).changed(
         Isotropic(frame, power[:1]),
-        Directions(frame, power[1:9], angles=sphere(16)[:8], concentration=5.0, towards=towards),
+        Directions(frame, power[1:9], angles=fibonacci_sphere(16)[:8], concentration=5.0, towards=towards),
         Leakage(frame, power[9:10]),
         Direct(frame, power[10:12]),
         Noise(frame, power[12:]),
@@ -67,7 +67,7 @@ def _tied(data, rows):
 
 
 def test_knots_add_up_and_mirrored_directions_count_alike():
-    half, zero = sphere(800), torch.zeros(3, dtype=torch.float64)
+    half, zero = fibonacci_sphere(800), torch.zeros(3, dtype=torch.float64)
     half = half[half[:, 2] > 0]
     term = Directions(
         Frame(zero, 10.0, 1.0, 1.0, zero), torch.ones(len(half)).double(), angles=half, concentration=8.0,
@@ -84,7 +84,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
     field = _tied(data, np.arange(len(data)))
     term, slots = field.prior[Directions], [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
-    ends = [At(slot, places) for slot in slots]
+    ends = [SlotPlaces(slot, places) for slot in slots]
     powers, together = term.of(slots), list(term.together(ends, ends))
     for number in (0, 3):
         alone = term.covariance(ends[number], ends[number])

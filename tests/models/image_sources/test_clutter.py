@@ -23,7 +23,7 @@ from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Cancelled, cancelled_by, late_when
+from gsparc.processes.worker import Cancelled, cancelled_by, ending_when
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -253,7 +253,7 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     rows = _beside_a_table(60)[0].rows
     start, looks = _bare(), []
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
-    with late_when(late):
+    with ending_when(late):
         found = find_clutter(rows, start, torch.Generator().manual_seed(0))
     assert isinstance(found, Scene) and len(looks) < 60
     with cancelled_by(lambda: True), pytest.raises(Cancelled):

@@ -12,8 +12,8 @@ from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import PowerField
-from gsparc.models.powers.fringes import Blend, nearest, sampled
-from gsparc.models.powers.waves import basis_of, decibels_of, fit_weights
+from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
+from gsparc.models.powers.waves import field_decibels, fit_wave_weights, plane_wave_basis
 from gsparc.ops import Pose
 
 LIGHT, WAVELENGTH = 299_792_458.0, 0.3
@@ -47,7 +47,7 @@ def interfering():
 
 def test_a_basis_is_of_unit_power_where_it_was_made():
     places = np.random.default_rng(0).uniform(0, 0.6, (300, 3)) * [1, 1, 0]
-    columns = basis_of(places, WAVELENGTH).columns(places)
+    columns = plane_wave_basis(places, WAVELENGTH).columns(places)
     assert (np.abs(columns) ** 2).sum(1).mean() == pytest.approx(1.0)
     assert 20 < columns.shape[1] < 60
 
@@ -55,11 +55,11 @@ def test_a_basis_is_of_unit_power_where_it_was_made():
 def test_powers_are_fitted_by_waves():
     rng = np.random.default_rng(0)
     places = rng.uniform(0, 0.5, (400, 3)) * [1, 1, 0]
-    columns = basis_of(places, WAVELENGTH).columns(places)
+    columns = plane_wave_basis(places, WAVELENGTH).columns(places)
     count = columns.shape[1]
     true = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / 2**0.5
-    decibels = decibels_of(columns @ true)
-    found = [decibels_of(columns @ fit_weights(columns, decibels, rng)) for _ in range(4)]
+    decibels = field_decibels(columns @ true)
+    found = [field_decibels(columns @ fit_wave_weights(columns, decibels, rng)) for _ in range(4)]
     assert min(np.median(np.abs(one - decibels)) for one in found) < 0.5
 
 
@@ -79,7 +79,7 @@ def test_fringes_were_judged_beside_a_process_of_some_rows(monkeypatch):
     data = plane(400)
     found = fitted_to(PowerField(), data, np.arange(400))[0].fringes
     assert found is not None and len(found.rows) == 150 + 40 and (found.fold < 0).sum() == 40
-    assert found.blend.distance[0] < 1.2 * np.median(nearest(data.moving))
+    assert found.blend.distance[0] < 1.2 * np.median(nearest_distances(data.moving))
 
 
 def test_far_from_all_rows_the_process_is_left_alone(interfering):
@@ -133,8 +133,14 @@ def test_few_rows_have_no_fringes():
 
 def test_what_is_sampled():
     places = plane(200).moving
-    assert sampled(places, WAVELENGTH) and not sampled(places, 0.01) and not sampled(places, None)
-    assert not sampled(np.hstack([places, places]), WAVELENGTH) and not sampled(places[:1], WAVELENGTH)
+    assert (
+        resolves_wavelength(places, WAVELENGTH)
+        and not resolves_wavelength(places, 0.01)
+        and not resolves_wavelength(places, None)
+    )
+    assert not resolves_wavelength(np.hstack([places, places]), WAVELENGTH) and not resolves_wavelength(
+        places[:1], WAVELENGTH
+    )
 
 
 def test_a_blend_goes_from_rows_to_groups_to_nothing():

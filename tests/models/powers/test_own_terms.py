@@ -47,7 +47,7 @@ def town(count: int = 160) -> dict[str, np.ndarray]:
 
 def test_the_length_inside_a_polygon_is_that_of_its_clipped_path(trees):
     data = town()
-    found = trees(GROVE, STILL).columns(torch.from_numpy(data["rx"]))[:, 0].numpy()
+    found = trees(GROVE).columns(torch.from_numpy(np.c_[data["rx"], np.tile(STILL, (160, 1))]))[:, 0].numpy()
     np.testing.assert_allclose(found, 0.1 * data["inside"], atol=1e-9)
 
 
@@ -56,13 +56,36 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
     known = {"rx": data["rx"][:40], "tx": STILL, "rssi": data["rssi"][:40], "model": "powers"}
     asked, truth = data["rx"][40:], data["rssi"][40:]
     plain = gsparc.fit(**known)
-    own = gsparc.fit(**known, settings={"terms": [trees(GROVE, STILL)]}, save=path)
+    own = gsparc.fit(**known, terms=[trees(GROVE)], save=path)
     errors = [np.std(one.rssi(rx=asked)[:, 0] - truth) for one in (own, plain)]
     assert errors[0] < 0.9 * errors[1], errors
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), own.rssi(rx=asked), atol=1e-5)
     stored.KINDS.pop("trees.Trees")
     with pytest.raises(CheckpointError, match=r"no term is called 'trees\.Trees': import the file"):
         gsparc.load(path)
+
+
+def test_each_of_several_stations_has_the_term_of_paths_to_it(trees):
+    """`model=gsparc` and several stations refused terms, which had to be told where the other end stood."""
+    data = town(60)
+    powers = np.c_[data["rssi"], data["rssi"]]
+    where = np.array([STILL, [300.0, -100.0, 50.0]])
+    given = gsparc.fit(rx=data["rx"], rssi=powers, station_position=where, terms=[trees(GROVE)])
+    copies = dict(given.method)
+    assert len(copies) == 2
+    for number, copy in copies.items():
+        (own,) = copy.only.trend.more
+        np.testing.assert_allclose(own.still.numpy() + own.origin.numpy(), where[number], atol=1e-3)
+    assert given.rssi(rx=data["rx"]).shape == (60, 2)
+
+
+def test_a_term_needs_both_ends_and_powers(trees):
+    data = town(40)
+    with pytest.raises(ValueError, match="finite numbers are needed, but the place of the end that stands"):
+        gsparc.fit(rx=data["rx"], rssi=data["rssi"], terms=trees(GROVE))
+    with pytest.raises(ValueError, match=r"model\.terms are of received powers"):
+        csi = np.ones((40, 1, 1), complex)
+        gsparc.fit(rx=data["rx"], tx=STILL, csi=csi, frequency_hz=[1e9], terms=trees(GROVE))
 
 
 def test_what_is_no_term_is_refused():
@@ -77,7 +100,7 @@ def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
             return super().columns(places)[:, 0]
 
     data = town(40)
-    own = {"terms": Flat(GROVE, STILL)}  # one alone needs no list
+    own = {"terms": Flat(GROVE)}  # one alone needs no list
     with pytest.raises(ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"):
         gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings=own)
 
@@ -96,10 +119,10 @@ def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
     data, file = town(60), tmp_path / "town.npz"
     levels = {"rx_position": data["rx"], "tx_position": STILL, "rssi_db": data["rssi"]}
     np.savez(file, **levels)
-    grove = f"model.terms=[{{_target_: trees.Trees, corners: {GROVE}, still: {STILL}}}]".replace(" ", "")
+    grove = f"model.terms=[{{_target_: trees.Trees, corners: {GROVE}}}]".replace(" ", "")
     folder = tmp_path / "run"
     settings = [f"dataset.file={file}", f"hydra.run.dir={folder}", "baselines=[]", "logger=none"]
-    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=powers", *settings, grove])
+    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=gsparc", *settings, grove])
     assert answer.status == 0, answer
     log = (folder / "train.log").read_text()
     said = re.search(r"Trees: (\S+) \+- (\S+)", log)

@@ -15,8 +15,8 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.kernels import smooth
-from gsparc.processes.kernel import apart
+from gsparc.models.channels.kernels import squared_exponential
+from gsparc.processes.kernel import distances
 
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
@@ -27,7 +27,7 @@ Cache = dict[Hashable, Any]
 T = TypeVar("T")
 
 
-def cached(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
+def get_or_make(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
     """Return what is kept by a key, made the first time."""
     if key not in cache:
         cache[key] = make()
@@ -113,7 +113,7 @@ class Basis:
 
     def dense(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
         """Return a piece of covariances (n, n), which equal places and keys share."""
-        return (cached(self.shared, (*self.key, key), lambda: self._dense(matrices())),)
+        return (get_or_make(self.shared, (*self.key, key), lambda: self._dense(matrices())),)
 
     def _dense(self, matrices: list[Tensor]) -> Dense:
         return Dense(torch.stack([self.of_rows(matrix) for matrix in matrices]))
@@ -129,7 +129,7 @@ class Basis:
 
     def factored(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
         """Return pieces of waves (W, n) whose gains vary over `length` [m]."""
-        roots = cached(self.shared, (self.key[0], length), lambda: self._roots(length))
+        roots = get_or_make(self.shared, (self.key[0], length), lambda: self._roots(length))
         wide = self.columns.T.to(torch.complex128)
         factors = [wide @ (wave[:, None] * roots) for wave in waves]
         few = roots.shape[1] <= LOW * len(wide)
@@ -137,6 +137,6 @@ class Basis:
 
     def _roots(self, length: float) -> Tensor:
         """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
-        size, vectors = torch.linalg.eigh(smooth(apart(self.places, self.places), length))
+        size, vectors = torch.linalg.eigh(squared_exponential(distances(self.places, self.places), length))
         mask = size > LOW_RANK * size[-1]
         return vectors[:, mask] * size[mask].sqrt()

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
-from gsparc.models.channels.kernels import steering
+from gsparc.models.channels.columns import Slot, SlotPlaces
+from gsparc.models.channels.kernels import spherical_wave
 from gsparc.models.channels.terms.spherical import Spherical
+from gsparc.processes.places import moving_end, of_both_ends, other_end
 
 
 @dataclass(frozen=True)
@@ -23,16 +24,17 @@ class Direct(Spherical):
         """Return the end (1, 3) [m], see `Spherical`."""
         return (slot.end + self.frame.offset)[None]
 
-    def waves(self, at: At) -> Tensor:
+    def waves(self, at: SlotPlaces) -> Tensor:
         """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
-        if at.places.shape[1] == 3:
+        if not of_both_ends(at.places):
             return super().waves(at)
-        middle, wavenumber = self.frame.middle[:3] - self.frame.middle[3:], at.slot.wavenumber
+        middle, wavenumber = moving_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)
-        between = at.places[:, :3] - at.places[:, 3:]
-        return steering(between, torch.zeros_like(middle), wavenumber, away)[None]
+        between = moving_end(at.places) - other_end(at.places)
+        return spherical_wave(between, torch.zeros_like(middle), wavenumber, away)[None]
 
     @property
     def worth(self) -> int:
         """Powers, the gain's length, and the offset where there is one."""
-        return 3 + 3 * bool(self.frame.offset.any())
+        offset = self.frame.offset
+        return len(self.power) + 1 + len(offset) * bool(offset.any())

@@ -15,13 +15,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
-from gsparc.models.channels.kernels import directed, envelope
+from gsparc.models.channels.columns import Slot, SlotPlaces
+from gsparc.models.channels.kernels import directional_correlation, matern_envelope
 from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
+from gsparc.processes.left_out import ENTRIES
 
-BLOCK = 1_000_000  # correlations of directions that are computed at a time
 HALF = 0.25  # length of the mean of directions from which they are of a half sphere
 TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1
 
@@ -65,35 +65,35 @@ class Directions(ChannelTerm):
 
     def correlations(self, angles: Tensor, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (M, n, m) complex128 of waves from each of `angles` (M, 3), in the envelope."""
-        middle, distance = b[:1], apart(a, b)  # differences of small numbers, wherever the origin is
+        middle, distance = b[:1], distances(a, b)  # differences of small numbers, wherever the origin is
         before, after = (wavenumber * (angles @ (places - middle).T) for places in (a, b))
         along = before[:, :, None] - after[:, None]
-        return directed((wavenumber * distance).square(), along, self.concentration)
+        return directional_correlation((wavenumber * distance).square(), along, self.concentration)
 
-    def covariance(self, a: At, b: At) -> Tensor:
+    def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `E sum_b p_b w_b V_b(d)` (n, m) complex128, see `Term`."""
         return next(iter(self.together([a], [b])))
 
-    def together(self, a: Sequence[At], b: Sequence[At]) -> Iterable[Tensor]:
+    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
         powers = self.of([one.slot for one in a]).to(torch.complex128)
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
-        for part in a[0].places.split(max(BLOCK // (len(other) * len(self.angles)), 1)):
+        for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
-            parts.append(each * envelope(apart(part, other), self.frame.envelope))
+            parts.append(each * matern_envelope(distances(part, other), self.frame.envelope))
         whole = torch.cat(parts, 1)
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
 
-    def variance(self, a: At) -> Tensor:
+    def variance(self, a: SlotPlaces) -> Tensor:
         """Return the sum of powers (n,), see `Term`."""
         return self.of([a.slot])[0].sum().expand(len(a.places))
 
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return one of M covariances, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 
         def matrices() -> list[Tensor]:
-            bound = envelope(apart(places, places), self.frame.envelope)
+            bound = matern_envelope(distances(places, places), self.frame.envelope)
             ones = self.angles.split(1)
             return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
 

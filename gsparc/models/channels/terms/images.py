@@ -8,7 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
+from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.terms.spherical import Spherical
 from gsparc.models.channels.terms.term import Frame
 from gsparc.physics.mirror_planes import images
@@ -38,14 +38,14 @@ class Images(Spherical):
         """Return the images (W, 3) [m], see `Spherical`."""
         return self.placed(slot.end)
 
-    def waves(self, at: At) -> Tensor:
+    def waves(self, at: SlotPlaces) -> Tensor:
         """Return waves (W, n), see `Spherical`; 0 of planes that have the end and the middle on two sides."""
         both = torch.stack([at.slot.end + self.frame.offset, self.frame.middle], 1)
-        sides = self.planes[:, :3] @ both - self.planes[:, 3:]
+        sides = self.planes[:, :-1] @ both - self.planes[:, -1:]
         # A mirror reflects to the side that it is lit from.
         return super().waves(at) * (sides[:, :1] * sides[:, 1:] > 0)
 
     @property
     def worth(self) -> int:
         """Powers and planes."""
-        return len(self.power) + 3 * len(self.planes)
+        return len(self.power) + self.planes[:, :-1].numel()

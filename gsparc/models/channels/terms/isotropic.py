@@ -8,8 +8,8 @@ from itertools import repeat
 
 from torch import Tensor
 
-from gsparc.models.channels.columns import At
-from gsparc.models.channels.kernels import plain
+from gsparc.models.channels.columns import SlotPlaces
+from gsparc.models.channels.kernels import isotropic_correlation
 from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import ChannelTerm
 
@@ -21,18 +21,18 @@ class Isotropic(ChannelTerm):
     name = "residual"
     is_real = True
 
-    def correlation(self, a: At, b: At) -> Tensor:
+    def correlation(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return the covariance (n, m) float64 of unit power."""
-        return plain(a.places, b.places, a.slot.wavenumber, self.frame.envelope)
+        return isotropic_correlation(a.places, b.places, a.slot.wavenumber, self.frame.envelope)
 
-    def covariance(self, a: At, b: At) -> Tensor:
+    def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `p E sinc(k d)` (n, m) float64, see `Term`."""
         return self.power * self.correlation(a, b)
 
-    def together(self, a: Sequence[At], b: Sequence[At]) -> Iterable[Tensor]:
+    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return the same for each, see `ChannelTerm`."""
         return repeat(self.covariance(a[0], b[0]), len(a))
 
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
         return basis.dense("isotropic", lambda: [self.correlation(at, at)])

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At
-from gsparc.models.channels.kernels import smooth
+from gsparc.models.channels.columns import SlotPlaces
+from gsparc.models.channels.kernels import squared_exponential
 from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import ChannelTerm
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class Leakage(ChannelTerm):
     name = "leakage"
     is_real = True
 
-    def covariance(self, a: At, b: At) -> Tensor:
+    def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `R p` (n, m) float64, see `Term`."""
-        return self.power * smooth(apart(a.places, b.places), self.frame.reach)
+        return self.power * squared_exponential(distances(a.places, b.places), self.frame.reach)
 
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
         return basis.factored(self.frame.reach, torch.ones(1, len(at.places), dtype=torch.complex128))

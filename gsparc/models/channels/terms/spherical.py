@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
-from gsparc.models.channels.kernels import smooth, steering
+from gsparc.models.channels.columns import Slot, SlotPlaces
+from gsparc.models.channels.kernels import spherical_wave, squared_exponential
 from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import ChannelTerm
-from gsparc.processes.kernel import apart
+from gsparc.processes.kernel import distances
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Spherical(ChannelTerm):
         """Return distances (W,) [m] from sources to the places' middle."""
         return torch.linalg.vector_norm(self.sources(slot) - self.frame.middle, dim=-1)
 
-    def waves(self, at: At) -> Tensor:
+    def waves(self, at: SlotPlaces) -> Tensor:
         """Return each wave (W, n) complex128, of size 1 in the middle."""
         sources, wavenumber = self.sources(at.slot), at.slot.wavenumber
         both = zip(sources, torch.linalg.vector_norm(sources - self.frame.middle, dim=-1), strict=True)
-        return torch.stack([steering(at.places, one, wavenumber, away) for one, away in both])
+        return torch.stack([spherical_wave(at.places, one, wavenumber, away) for one, away in both])
 
     @property
     def gains(self) -> tuple[Tensor, Tensor]:
@@ -43,17 +43,19 @@ class Spherical(ChannelTerm):
         fixed, varying = self.power.view(2, -1)
         return fixed, varying
 
-    def covariance(self, a: At, b: At) -> Tensor:
+    def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return that of all waves (n, m) complex128, see `Term`."""
-        distance, before, after = apart(a.places, b.places), self.waves(a), self.waves(b)
+        distance, before, after = distances(a.places, b.places), self.waves(a), self.waves(b)
         fixed, varying = ((before.T * power) @ after.conj() for power in self.gains)
-        return fixed * smooth(distance, self.frame.reach) + varying * smooth(distance, self.frame.gain)
+        return fixed * squared_exponential(distance, self.frame.reach) + varying * squared_exponential(
+            distance, self.frame.gain
+        )
 
-    def variance(self, a: At) -> Tensor:
+    def variance(self, a: SlotPlaces) -> Tensor:
         """Return that of all waves (n,), see `Term`."""
         return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
 
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
         waves, frame = self.waves(at), self.frame
         return basis.factored(frame.reach, waves) + basis.factored(frame.gain, waves)

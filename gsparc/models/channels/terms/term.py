@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.columns import At, Slot
+from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.terms.compressed import Basis, Dense, Piece
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
@@ -37,7 +37,7 @@ class Frame(Stored):
 
 
 @dataclass(frozen=True)
-class ChannelTerm(Term[At]):
+class ChannelTerm(Term[SlotPlaces]):
     """One term, relative to each group's scale.
 
     Attributes:
@@ -54,18 +54,18 @@ class ChannelTerm(Term[At]):
     frame: Frame
     power: Tensor
 
-    def together(self, a: Sequence[At], b: Sequence[At]) -> Iterable[Tensor]:
+    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances (n, m) of several ends of one wavelength, one by one.
 
         Places of all `a` differ by one displacement at most, those of `b` by the same.
         """
         return map(self.covariance, a, b)
 
-    def variance(self, a: At) -> Tensor:
+    def variance(self, a: SlotPlaces) -> Tensor:
         """Return the variance (n,), see `Term`."""
         return self.power.sum().expand(len(a.places))
 
-    def pieces(self, at: At, basis: Basis) -> tuple[Piece, ...]:
+    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
         # A logarithm of 0 is unit power.
         return (Dense(basis.of_rows(self.at(self.power[:0].new_zeros(1)).covariance(at, at))[None]),)

@@ -23,7 +23,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Cancelled, cancelled_by, late, raise_if_cancelled
+from gsparc.processes.worker import Cancelled, cancelled_by, out_of_time, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +41,8 @@ def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
     """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `late`, what was
-    found so far is the result.
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `out_of_time`, what
+    was found so far is the result.
 
     Args:
         rows: of one output, as many as in a search.
@@ -120,7 +120,7 @@ class _ClutterSearcher:
         start = self.nll
         best = self.whole = start, self.scene
         try:
-            with cancelled_by(late):  # within a step, too
+            with cancelled_by(out_of_time):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
                     self._improve()

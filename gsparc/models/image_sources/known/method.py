@@ -28,7 +28,7 @@ from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_am
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections, normal_form
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class KnownWallsGP(ImageSourceGP):
             near = walls_prior_cost(given.planes, given.sequences, moved.planes, moved.log_amplitude)
             return near + prior.cost(moved.phase, given.sequences)
 
-        with late_when(budget.over):
+        with ending_when(budget.over):
             scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, self.kernel)
             prior = ReflectionPhasePrior.of(scene)

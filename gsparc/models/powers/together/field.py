@@ -24,24 +24,30 @@ from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.per_station import SAME_PLACE_M
-from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
-from gsparc.models.powers.together.network import by_site, learn_network, network_of
-from gsparc.models.powers.together.terms import Terms, link_rows, places_of
+from gsparc.models.powers.together.learning import (
+    TRIED_EACH,
+    StationPriors,
+    learn_shared_terms,
+    learn_station_priors,
+)
+from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
+from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations, station_places
 from gsparc.models.target_rows import entry_variance, from_real
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
+from gsparc.processes.places import moving_end, other_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import REACH
+from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
-from gsparc.processes.shared import Shared
+from gsparc.processes.shared import SharedTermsPosterior
+from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
 NEVER = -1  # in place of a station's number: one that was never heard
-MOST_EACH = 6_000  # rows of a station
 MEMORY = 3e9  # bytes of all stations' factors
-PLACES = 600  # that the shared process is known at in the end
+PLACES = 2 * TRIED_EACH  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
@@ -56,21 +62,21 @@ class JointPowerField(ClosedForm):
     name = "process of many stations' powers"
     site: Site
     places: np.ndarray  # (T, 3) float64 of the stations [m]
-    own: Own  # of the stations' own processes
-    heard: Terms  # shared terms for stations that have rows
-    unheard: Terms  # those for all others
+    own: StationPriors  # of the stations' own processes
+    heard: SharedTerms  # shared terms for stations that have rows
+    unheard: SharedTerms  # those for all others
 
     def __init__(self, shared: bool = True, seed: int = 0) -> None:
         self.shared, self.seed = shared, seed
         self.inflation = 1.0  # of variances of stations never heard
-        self.posterior: Shared | None = None
-        self.elsewhere: Shared | None = None
+        self.posterior: SharedTermsPosterior | None = None
+        self.elsewhere: SharedTermsPosterior | None = None
         self.whole = 1.0  # variance of what was measured, of all stations [dB^2]
         self.rows: dict[int, Tensor] = {}  # of what was heard of each station
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
 
     @classmethod
-    def of(cls, site: Site, places: np.ndarray, own: Own, terms: Terms) -> JointPowerField:
+    def of(cls, site: Site, places: np.ndarray, own: StationPriors, terms: SharedTerms) -> JointPowerField:
         """Return one of known settings whose stations share `terms`, to be conditioned."""
         result = cls()
         result.site, result.places, result.own = site, places, own
@@ -96,23 +102,22 @@ class JointPowerField(ClosedForm):
     def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
         assert data.site.stations is not None
-        self.places, notes = places_of(data, rows)
-        every = link_rows(data, rows, self.places)
-        network = network_of(data, self.places)
+        self.places, notes = station_places(data, rows)
+        every = rows_of_stations(data, rows, self.places)
+        network = find_sectors(data, self.places)
         if network is None:
-            self.own, remarks = learn_own(every, self.seed, budget)
+            self.own, remarks = learn_station_priors(every, self.seed, budget)
         else:
-            every = by_site(every, network)
+            every = relabel_by_site(every, network)
             prior, remarks = learn_network(every, network, data.site.stations.name, self.seed, budget)
-            self.own = Own(prior, {})
-        most, largest = most_each(len(every.stations)), int(np.bincount(every.station).max())
+            self.own = StationPriors(prior, {})
+        most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        assert self.own.never.trend is not None
-        self.heard = self.unheard = Terms.over(every, self.own.never.trend, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.over(every, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
-        terms, self.inflation, gain = learn_strength(every, self.own, self.seed, budget)
+        terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)
         if gain is None:
             remarks.append("no shared terms: too few stations to leave some out")
             return (*notes, *remarks)
@@ -141,16 +146,15 @@ class JointPowerField(ClosedForm):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; silent rows say that powers are below a level."""
-        every = link_rows(data, rows, self.places)
-        every = every if self.network is None else by_site(every, self.network)
-        used = every.thinned(most_each(len(every.stations)), self.seed)
+        every = rows_of_stations(data, rows, self.places)
+        every = every if self.network is None else relabel_by_site(every, self.network)
+        used = every.thinned(rows_per_station(len(every.stations)), self.seed)
         self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
             elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
-        loud = used if used.silent.all() else used.loud
-        self.whole = max(float(loud.decibels.var()), self.own.variance)
+        self.whole = max(float(used.heard.decibels.var()), self.own.variance)
         self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
 
     def predict(self, query: Query) -> Prediction:
@@ -163,14 +167,15 @@ class JointPowerField(ClosedForm):
         """
         posterior, elsewhere = self._conditioned()
         places, number = self._by_process(*self._ends(query))
-        mean, spread, share = (torch.zeros(len(places), dtype=torch.float64) for _ in range(3))
+        mean = torch.zeros(len(places), dtype=torch.float64)
+        spread, share = torch.zeros_like(mean), torch.zeros_like(mean)
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
             if chosen.any():
                 mean[chosen], left = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
-        share = (share + self._by_law(places[:, :3])).clamp_max(1.0)
+        share = (share + self._by_law(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         power = self._power(mean)
         return Prediction(power, entry_variance(spread, power, "rssi"), share)
@@ -184,7 +189,7 @@ class JointPowerField(ClosedForm):
             stations: (k,) int64, of each place of a group: several of one place, or one of several.
         """
         posterior, elsewhere = self._conditioned()
-        still = torch.from_numpy(self.places)[stations].expand(*moving.shape[:2], 3)
+        still = torch.from_numpy(self.places)[stations].expand_as(moving)
         places = torch.cat([moving.double(), still], 2).flatten(0, 1)
         places, number = self._by_process(places, stations.repeat(len(moving)))
         places, number = places.unflatten(0, moving.shape[:2]), number[: len(stations)]
@@ -236,22 +241,22 @@ class JointPowerField(ClosedForm):
         """See `Method.restore`."""
         self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
         never = Prior.read(state["never"])
-        assert never.trend is not None
-        self.own = Own(never, {int(number): Prior.read(part) for number, part in state["own"].items()})
-        self.heard, self.unheard = (Terms(never.trend, **state[name]) for name in ("heard", "unheard"))
+        heard = {int(number): Prior.read(part) for number, part in state["own"].items()}
+        self.own = StationPriors(never, heard)
+        self.heard, self.unheard = (SharedTerms.read(state[name]) for name in ("heard", "unheard"))
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
         if "processes" in state:
             processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
             weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
-            self.posterior = Shared(processes, never, self.heard.columns, weights[0])
+            self.posterior = SharedTermsPosterior(processes, never, self.heard.columns, weights[0])
             self.elsewhere = self._elsewhere(weights[1])
 
-    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> Shared:
+    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
         """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
         never, network = self.own.never, self.network
         never = never if network is None else replace(never, trend=network.joined_by(ROUND))
-        return Shared({}, never, self.unheard.columns, weights)
+        return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
     def with_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
         """Return one that knows k further stations, of no rows, as its last.
@@ -266,7 +271,7 @@ class JointPowerField(ClosedForm):
         """
         _, elsewhere = self._conditioned()
         result, network = copy(self), self.network
-        result.places = np.concatenate([self.places, np.broadcast_to(place, (len(sectors), 3))])
+        result.places = np.concatenate([self.places, np.tile(place, (len(sectors), 1))])
         if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
             raise DataError("azimuths of a new station: this model was learned without azimuths")
         if network is not None:
@@ -275,7 +280,7 @@ class JointPowerField(ClosedForm):
         result.elsewhere = result._elsewhere((elsewhere.factor, elsewhere.mean))
         return result
 
-    def _conditioned(self) -> tuple[Shared, Shared]:
+    def _conditioned(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
         if self.posterior is None or self.elsewhere is None:
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
@@ -283,7 +288,7 @@ class JointPowerField(ClosedForm):
     def _ends(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
         sender = query.tx.cpu().double()
-        receiver = query.rx.position.reshape(-1, 3).expand(len(query), 3).cpu().double()
+        receiver = query.rx.position.expand(len(query), -1).cpu().double()
         moving, still = (sender, receiver) if self.site.static_end == "rx" else (receiver, sender)
         table = torch.from_numpy(self.places)
         if query.station is not None:
@@ -294,7 +299,7 @@ class JointPowerField(ClosedForm):
         turned = (number < 0) & (self._standing(moving) >= 0)  # asked the other way round
         here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
         places = torch.where(turned[:, None], there, here)
-        return places, self._standing(places[:, 3:])
+        return places, self._standing(other_end(places))
 
     def _by_process(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
@@ -311,8 +316,8 @@ class JointPowerField(ClosedForm):
         """
         if self._reach is None:
             posterior, _ = self._conditioned()
-            known = torch.cat([one.rows[:, :3] for one in posterior.processes.values()]).numpy()
-            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), 1e-9)
+            known = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
+            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), TINY_M)
         tree, reach = self._reach
         far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)
@@ -328,6 +333,6 @@ class JointPowerField(ClosedForm):
         return from_real(decibels[:, None], "rssi", (1,))
 
 
-def most_each(stations: int) -> int:
+def rows_per_station(stations: int) -> int:
     """Return rows of each station whose factors fit into memory together."""
-    return min(MOST_EACH, int(math.sqrt(MEMORY / 8 / stations)))
+    return min(MOST_ROWS, int(math.sqrt(MEMORY / torch.float64.itemsize / stations)))

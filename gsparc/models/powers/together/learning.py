@@ -7,7 +7,7 @@ rows hardly tells how strong they are. Each station by turns is predicted from t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
@@ -16,28 +16,28 @@ import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.groups import Gain, compared
-from gsparc.models.powers.together.terms import LinkRows, Terms
-from gsparc.processes.density import LeftOutDensity, by_left_out, gram_of, walked
-from gsparc.processes.kernel import Kernel, apart
+from gsparc.models.powers.groups import ErrorGain, compare_errors
+from gsparc.models.powers.together.terms import SharedTerms, StationRows
+from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.places import beyond_ends, moving_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import LEAST_SILENT, conditioned
+from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
-from gsparc.processes.shared import Block, Shared, deviation_of, left_out_whole
+from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import late_when
+from gsparc.processes.worker import ending_when
 from gsparc.training.time_budget import TimeBudget
 
-LOOKS, SETTLED = 40, 1e-6
 START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+SETTLED = 1e-6  # of settings that all stations have alike
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
-FITTED_ON = 500  # rows of each station, for the law
-LEARNED_ON, LEARNED_EACH = 6_000, 500  # rows of all stations, and of each, for settings that all have alike
+LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
 ENDS_FROM, ENDS_ON = 400, 700  # rows that a station needs for settings of its own, and has them from
 LEAST_STATIONS = 3  # to leave some out
-TRIED_ON, TRIED_EACH = 3_600, 300  # rows of all stations, and of each, for the strength of shared terms
-TRIED_PLACES = 300  # that the shared process is known at
+TRIED_ON = 3_600  # rows of all stations for the strength of shared terms
+TRIED_EACH = 300  # of each, and places that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
@@ -45,28 +45,8 @@ TOLD = 20.0  # amplitudes of a pseudo-value's variance, beyond which it is left 
 WIDEST = 4.0  # factor that variances are corrected by at most
 
 
-PLAIN = Trend(0.0)
-
-
 @dataclass(frozen=True)
-class WithTerms(Trend):
-    """A trend with what all stations share among its uncertain terms, in units of `unit` [dB]."""
-
-    inner: Trend = PLAIN
-    shared: Callable[[Tensor], Tensor] = torch.zeros_like
-    unit: float = 1.0
-
-    def mean(self, places: Tensor) -> Tensor:
-        """See `Trend`."""
-        return self.inner.mean(places)
-
-    def columns(self, places: Tensor) -> Tensor:
-        """See `Trend`."""
-        return torch.cat([self.inner.columns(places), self.shared(places) / self.unit], 1)
-
-
-@dataclass(frozen=True)
-class Own:
+class StationPriors:
     """Priors of stations' own processes.
 
     Attributes:
@@ -81,7 +61,7 @@ class Own:
         """Return that of a station."""
         return self.heard.get(number, self.never)
 
-    def given(self, rows: LinkRows, terms: Terms, seed: int) -> Shared:
+    def given(self, rows: StationRows, terms: SharedTerms, seed: int) -> SharedTermsPosterior:
         """Return what rows say; pseudo-values of silent ones follow from their own station's."""
         result = {}
         for number in rows.stations:
@@ -89,15 +69,16 @@ class Own:
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
-                wide = WithTerms(0.0, inner=_trend(prior), shared=terms.columns, unit=deviation_of(prior))
+                shared = replace(terms, unit=process_deviation(prior))
+                wide = replace(prior.known_trend, more=(*prior.known_trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
-                least = LEAST_SILENT * len(np.unique(part.places[:, 6:], axis=0))
-                known = conditioned(part, Prior(prior.kernel, wide), seed, least)[0].posterior  # type: ignore[arg-type]
+                least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
+                known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
             result[number] = Exact.of(prior, places, values, extra)
-        return Shared(result, self.never, terms.columns)
+        return SharedTermsPosterior(result, self.never, terms.columns)
 
     @property
     def variance(self) -> float:
@@ -105,36 +86,32 @@ class Own:
         return self.never.kernel.amplitude * (1 + self.never.kernel.noise)
 
 
-def _trend(prior: Prior) -> Trend:
-    assert prior.trend is not None
-    return prior.trend
-
-
-def learn_own(rows: LinkRows, seed: int, budget: TimeBudget | None = None) -> tuple[Own, list[str]]:
+def learn_station_priors(
+    rows: StationRows, seed: int, budget: TimeBudget | None = None
+) -> tuple[StationPriors, list[str]]:
     """Return the law and settings of own processes, and what must be said of them.
 
     Searches end with what they have when the budget is over; single stations then have no settings of
     their own.
     """
     trend, notes = _site_law(rows, seed)
-    heard = rows if rows.silent.all() else rows.loud
+    heard = rows.heard
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
-    with nullcontext() if budget is None else late_when(budget.over):
+    with nullcontext() if budget is None else ending_when(budget.over):
         kernel, priors = _common_settings(heard, trend, seed)
         if budget is not None and budget.over():
             numbers = []
         for number in numbers:
-            distance, columns, values = _view(heard.of(number).thinned(ENDS_ON, seed), trend)
-            bounds = kernel.bounds(distance)
-            _, own = by_left_out([kernel], distance, columns, values, bounds, LOOKS, SETTLED)
+            some = heard.of(number).thinned(ENDS_ON, seed)
+            _, own = fit_kernel_by_left_out([kernel], *some.regression_about(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
-    return Own(Prior(kernel, trend), priors), notes
+    return StationPriors(Prior(kernel, trend), priors), notes
 
 
-def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
+def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     """The law of all stations, of their median level, and what must be said of it."""
-    few = rows.thinned(FITTED_ON, seed)
+    few = rows.thinned(LEARNED_EACH, seed)
     law = fit_law(few, None)
     residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
     residuals = [residual[few.station == number] for number in few.stations]
@@ -146,23 +123,23 @@ def _site_law(rows: LinkRows, seed: int) -> tuple[Trend, list[str]]:
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
 
 
-def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
+def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
-    few = heard.thinned(min(LEARNED_EACH, max(LEARNED_ON // len(heard.stations), 1)), seed)
-    views = {number: _view(few.of(number), trend) for number in few.stations}
-    at = torch.from_numpy(np.unique(few.places[:, :3], axis=0)[:: max(1, len(few.places) // 4_000)])
-    far = apart(at, at)
+    few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
+    views = {number: few.of(number).regression_about(trend) for number in few.stations}
+    at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
+    far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
     start = Kernel.matern([length * middle for length in START.lengths], START.shares, START.noise)
 
     def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
-        return LeftOutDensity.apply(gram_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
+        return LeftOutDensity.apply(covariance_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
 
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = walked(objective, [start.parameters().numpy()], start.bounds(far), LOOKS, SETTLED)
+    best, _ = minimise(objective, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
     logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
@@ -174,16 +151,9 @@ def _common_settings(heard: LinkRows, trend: Trend, seed: int) -> tuple[Kernel, 
     }
 
 
-def _view(rows: LinkRows, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances (n, n) [m], uncertain terms (n, Q) and values less the mean (n, 1) [dB]."""
-    places = torch.from_numpy(rows.places)
-    values = torch.from_numpy(rows.decibels) - trend.mean(places)
-    return apart(places, places), trend.columns(places), values[:, None]
-
-
-def learn_strength(
-    rows: LinkRows, own: Own, seed: int, budget: TimeBudget | None = None
-) -> tuple[Terms, float, Gain | None]:
+def learn_shared_terms(
+    rows: StationRows, own: StationPriors, seed: int, budget: TimeBudget | None = None
+) -> tuple[SharedTerms, float, ErrorGain | None]:
     """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
@@ -196,10 +166,10 @@ def learn_strength(
         The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
         g gains at these, each after one constant, None if not tried.
     """
-    heard = rows if rows.silent.all() else rows.loud
+    heard = rows.heard
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = Terms.over(few, _trend(own.never), LENGTHS[0] * short, TRIED_PLACES, seed)
+    bare = SharedTerms.over(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.given(few, bare, seed).processes
@@ -212,19 +182,20 @@ def learn_strength(
             result = _left_out(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
-    gain = compared(best[1] ** 2, plain[1] ** 2, plain[3])
+    (_, errors, *_), (_, others, _, station) = best, plain
+    gain = compare_errors(errors**2, others**2, station)
     terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
-def _left_out(processes: Mapping[int, Exact], terms: Terms) -> tuple[np.ndarray, float, np.ndarray]:
+def _left_out(processes: Mapping[int, Exact], terms: SharedTerms) -> tuple[np.ndarray, float, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
     errors, ratios = [], []
     blocks = [Block.of(process, terms.columns(process.rows)) for process in processes.values()]
-    for error, variance in left_out_whole(blocks):
+    for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())
     station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])

@@ -9,27 +9,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.models.baselines.distance_law import seek_place
+from gsparc.models.baselines.distance_law import locate_still_end
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import apart, matern32
-from gsparc.processes.powers import Rows
+from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.nearest import JITTER
+from gsparc.processes.places import NO_PLACES, moving_end
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.sectors import Sectors
+from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 
-LAW_DB = (5.0, 5.0)  # deviations a decade from the middle, of a slope and of a bend
-JITTER = 1e-6  # of a correlation's diagonal
+LAW_DB = 5.0  # deviation a decade from the middle, of a slope and of a bend
 
 
 @dataclass(frozen=True)
-class LinkRows(Rows):
+class StationRows(PowerRows):
     """Rows of several stations; `places` (n, 6) float64 are of the moving end and of the station [m].
 
     Attributes:
@@ -45,16 +46,16 @@ class LinkRows(Rows):
         """Numbers of the stations that have rows, ascending."""
         return [int(number) for number in np.unique(self.station)]
 
-    def of(self, number: int) -> LinkRows:
+    def of(self, number: int) -> StationRows:
         """Return the rows of one station."""
         return self.at(np.flatnonzero(self.station == number))
 
-    def thinned(self, each: int, seed: int) -> LinkRows:
+    def thinned(self, each: int, seed: int) -> StationRows:
         """Return at most so many rows of each station, at places that they share where they do.
 
         Rows where something was heard come first where there are too many, up to half of them.
         """
-        _, place = np.unique(self.places[:, :3], axis=0, return_inverse=True)
+        _, place = np.unique(moving_end(self.places), axis=0, return_inverse=True)
         place = place.reshape(-1)
         # One rank for a place: stations that share places keep the same ones.
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
@@ -70,7 +71,7 @@ class LinkRows(Rows):
         return self.at(np.sort(np.concatenate(chosen)))
 
 
-def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def station_places(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
     assert site.stations is not None and data.station is not None
@@ -78,24 +79,24 @@ def places_of(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[s
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
         own = rows[data.station[rows] == number]
         if len(own):
-            places[number] = seek_place(power_rows(data, own))
+            places[number] = locate_still_end(power_rows(data, own))
             where = ", ".join(f"{value:.4g}" for value in places[number] + site.origin)
             name = site.stations.name[number]
             notes.append(f"the place of station {name} is not given; estimated from powers at ({where}) m")
     return places, tuple(notes)
 
 
-def link_rows(data: Measurements, rows: np.ndarray, places: np.ndarray) -> LinkRows:
+def rows_of_stations(data: Measurements, rows: np.ndarray, places: np.ndarray) -> StationRows:
     """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
     assert data.station is not None
     station = data.station[rows].astype(np.int64)
     seen = power_rows(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
-    return LinkRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
+    return StationRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
 
 
 @dataclass(frozen=True)
-class Terms:
+class SharedTerms(Columns):
     """Shared terms; tensors are float64.
 
     Attributes:
@@ -104,6 +105,7 @@ class Terms:
         inducing: (M, 3) places that g is known at [m].
         length: of g [m].
         place_db: deviation of g; 0: there is none.
+        unit: of columns [dB].
     """
 
     trend: Trend
@@ -112,45 +114,41 @@ class Terms:
     inducing: Tensor
     length: float
     place_db: float = 0.0
+    unit: float = 1.0
 
     @classmethod
-    def over(cls, rows: LinkRows, trend: Trend, length: float, places: int, seed: int) -> Terms:
+    def over(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
-        none = torch.zeros(0, 3, dtype=torch.float64)
-        bare = cls(trend, float(decades.min()), float(decades.max()), none, length)
+        bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)
         return bare.known_at(rows, places, seed)
 
-    def known_at(self, rows: LinkRows, most: int, seed: int) -> Terms:
+    def known_at(self, rows: StationRows, most: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
-        every = np.unique(rows.places[:, :3], axis=0)
+        every = np.unique(moving_end(rows.places), axis=0)
         order = np.random.default_rng(seed).permutation(len(every))[:most]
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
-        """Return (n, P) [dB] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
+        """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
         if isinstance(self.trend, Sectors):
             return places.new_zeros(len(places), 0)  # each site has its own
         decades = _decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
         # Beyond what was heard the parabola goes on as its tangent.
         bend = inside.square() + 2 * inside * (decades - inside)
-        law = torch.stack([decades, bend], 1) * torch.tensor(LAW_DB, dtype=torch.float64)
+        law = LAW_DB * torch.stack([decades, bend], 1)
         if not self.place_db:
-            return law
-        near = matern32(apart(self.inducing, places[:, :3]), self.length)
-        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1)
+            return law / self.unit
+        near = matern32(distances(self.inducing, moving_end(places)), self.length)
+        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1) / self.unit
 
     @cached_property
     def _factor(self) -> Factor:
-        gram = matern32(apart(self.inducing, self.inducing), self.length)
+        gram = matern32(distances(self.inducing, self.inducing), self.length)
         # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
         return Factor.of(gram, "raise")
-
-    def state(self) -> dict[str, Any]:
-        """Return tensors and numbers that it is made of, but for the trend."""
-        return {name: value for name, value in vars(self).items() if name not in ("trend", "_factor")}
 
 
 def _decades(trend: Trend, places: Tensor) -> Tensor:

@@ -23,14 +23,14 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc, choose
 from gsparc.models.per_station import by_station
 from gsparc.models.powers.together import field as together
-from gsparc.models.powers.together.field import JointPowerField, most_each
-from gsparc.models.powers.together.learning import Own, learn_own, learn_strength
-from gsparc.models.powers.together.terms import Terms, link_rows, places_of
+from gsparc.models.powers.together.field import JointPowerField, rows_per_station
+from gsparc.models.powers.together.learning import StationPriors, learn_shared_terms, learn_station_priors
+from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations, station_places
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
-from gsparc.processes.shared import left_out_whole
+from gsparc.processes.shared import left_out_processes
 from gsparc.processes.trend import Law, Trend
 from gsparc.training.context import FitContext
 
@@ -59,21 +59,21 @@ def smooth(places: np.ndarray, length: float, rng: np.random.Generator, count: i
     return np.cos(phases) @ rng.normal(size=(200, count)) / 10
 
 
-def prior_of(data: Measurements) -> tuple[Own, Terms]:
+def prior_of(data: Measurements) -> tuple[StationPriors, SharedTerms]:
     """Invented settings with every term."""
     trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
     never = Prior(Kernel.matern((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
-    own = Own(never, {1: Prior(Kernel.matern((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
-    terms = Terms.over(rows_of(data), trend, 8.0, 30, 0)
+    own = StationPriors(never, {1: Prior(Kernel.matern((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
+    terms = SharedTerms.over(rows_of(data), trend, 8.0, 30, 0)
     return own, replace(terms, place_db=2.7)
 
 
 def rows_of(data: Measurements, rows: np.ndarray | None = None):
     rows = np.arange(len(data)) if rows is None else rows
-    return link_rows(data, rows, places_of(data, rows)[0])
+    return rows_of_stations(data, rows, station_places(data, rows)[0])
 
 
-def dense(rows, own: Own, terms: Terms) -> tuple[np.ndarray, np.ndarray]:
+def dense(rows, own: StationPriors, terms: SharedTerms) -> tuple[np.ndarray, np.ndarray]:
     """Covariance (n, n) of rows with noise, and values (n,) less the law, by what the prior says of pairs."""
     places = torch.from_numpy(rows.places)
     columns = terms.columns(places)
@@ -144,7 +144,7 @@ def test_rows_and_stations_left_out():
     inverse = np.linalg.inv(gram)
     error, variance = inverse @ values / inverse.diagonal(), 1 / inverse.diagonal()
     posterior = own.given(every, terms, 0)
-    whole = left_out_whole([posterior.block(number) for number in every.stations])
+    whole = left_out_processes([posterior.block(number) for number in every.stations])
     for number, of_station in zip(every.stations, whole, strict=True):
         at = np.flatnonzero(every.station == number)
         found = posterior.left_out(number)
@@ -158,15 +158,17 @@ def test_rows_and_stations_left_out():
 
 
 def test_the_law_of_a_site():
-    own, notes = learn_own(rows_of(town(90, 0.0)), 0)
+    own, notes = learn_station_priors(rows_of(town(90, 0.0)), 0)
     law = own.never.trend.law
     assert abs(law.exponent - 3) < 0.7 and "6 stations in one model" in notes[0], law
 
 
 def test_settings_become_likelier():
     rows, densities = rows_of(town()), []
-    learned, _ = learn_own(rows, 0)
-    begin = Own(replace(learned.never, kernel=Kernel.matern((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {})
+    learned, _ = learn_station_priors(rows, 0)
+    begin = StationPriors(
+        replace(learned.never, kernel=Kernel.matern((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {}
+    )
     for own in (begin, learned):
         posterior = own.given(rows, prior_of(town())[1], 0)
         found = [posterior.left_out(number) for number in rows.stations]
@@ -229,7 +231,7 @@ def test_silent_rows_say_that_powers_are_low():
     (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
     for used in (rows, rows[~quiet]):
-        field = JointPowerField.of(data.site, places_of(data, rows)[0], own, terms)
+        field = JointPowerField.of(data.site, station_places(data, rows)[0], own, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
         errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
@@ -254,7 +256,7 @@ def test_rows_are_thinned_at_places_that_stations_share():
     few = rows_of(town()).thinned(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
     assert len(np.unique(few.places[:, :3], axis=0)) == 20
-    assert most_each(1) == together.MOST_EACH and 3_500 < most_each(12) < together.MOST_EACH
+    assert rows_per_station(1) == together.MOST_ROWS and 3_500 < rows_per_station(12) < together.MOST_ROWS
 
 
 def test_what_it_refuses():
@@ -321,9 +323,9 @@ def test_halls_gain_over_a_process_of_each_sensor():
 
 def test_the_error_of_a_gain_is_that_of_stations():
     every = rows_of(town())
-    own, _ = learn_own(every, 0)
+    own, _ = learn_station_priors(every, 0)
     turned = every.at(np.argsort(every.station, kind="stable"))
-    one, other = (learn_strength(rows, own, 0)[2] for rows in (every, turned))
+    one, other = (learn_shared_terms(rows, own, 0)[2] for rows in (every, turned))
     assert one is not None and other is not None
     assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)
     assert one.error > 0.05 * one.squares

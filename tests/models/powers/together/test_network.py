@@ -17,12 +17,14 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, by_station
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.learning import Own
-from gsparc.models.powers.together.network import network_of
-from gsparc.models.powers.together.terms import Terms, link_rows
+from gsparc.models.powers.together.learning import StationPriors
+from gsparc.models.powers.together.network import find_sectors
+from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations
 from gsparc.ops import Pose
+from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
-from gsparc.processes.sectors import NO_AZIMUTH, SectorKernel, Sectors
+from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -115,10 +117,10 @@ def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
 def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
-    assert network_of(data, one.place).site.max() == 9
-    assert network_of(data, one.place + 500 * np.arange(30)[:, None]) is None
+    assert find_sectors(data, one.place).site.max() == 9
+    assert find_sectors(data, one.place + 500 * np.arange(30)[:, None]) is None
     whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
-    assert network_of(whole) is None  # of all stations, not of the strongest
+    assert find_sectors(whole) is None  # of all stations, not of the strongest
 
 
 def test_sectors_belong_to_a_site_by_name_or_by_a_column():
@@ -127,11 +129,11 @@ def test_sectors_belong_to_a_site_by_name_or_by_a_column():
     apart = replace(one, place=one.place + np.tile([[0.0, 0, 0], [20, 0, 0], [0, 20, 0]], (10, 1)))
     arrays = apart.arrays(6)
     said = from_arrays(arrays, {"name": "network"})
-    assert network_of(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
+    assert find_sectors(said).site.tolist() == np.repeat(np.arange(10), 3).tolist()
     names = {"station_name": np.array([f"cell{i}" for i in range(30)])}
-    assert network_of(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
+    assert find_sectors(from_arrays(arrays | names, {"name": "network"})).site.max() == 29
     column = {"station_site": np.repeat(np.arange(10.0), 3)}
-    assert network_of(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
+    assert find_sectors(from_arrays(arrays | names | column, {"name": "network"})).site.max() == 9
 
 
 def sectors() -> Sectors:
@@ -158,14 +160,18 @@ def test_the_pattern_of_a_sector():
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
 
 
+def shadowing() -> Kernel:
+    return Kernel((SectorShadowing((50.0, 50.0), (0.5, 0.2, 0.2, 0.1)), WhiteNoise(0.1)), 20.0)
+
+
 def given_settings() -> JointPowerField:
     """A network's field whose settings nobody learned."""
     one = network(1, moments=60, asked=20)
     data, rows = one.data(6), np.arange(360)
-    known = network_of(data)
+    known = find_sectors(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
-    own = Own(Prior(SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0), trend), {})
-    terms = Terms.over(link_rows(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    own = StationPriors(Prior(shadowing(), trend), {})
+    terms = SharedTerms.over(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
     field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
     return field
@@ -195,13 +201,12 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
 
 
 def test_sectors_of_a_site_share_shadowing():
-    kernel = SectorKernel((50.0, 50.0), (0.5, 0.2, 0.2, 0.1), 0.1, 20.0)
+    kernel = shadowing()
     here, there = places(0, 10.0), places(1, 10.0)
     assert float(kernel.between(here, here)) == pytest.approx(1.0)
     assert float(kernel.between(here, there)) == pytest.approx(0.5)
     both = torch.cat([here, there, places(0, 200.0)])
     assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    logs = torch.tensor([50.0, 50, 10, 4, 4, 2, 2]).double().log()
-    for again in (SectorKernel.read(kernel.state()), SectorKernel.of(logs)):
-        assert torch.allclose(again.between(both, both), kernel.between(both, both))
-        assert float(again.noise) == pytest.approx(0.1) and float(again.amplitude) == pytest.approx(20)
+    for again in (restored(stored(kernel)), kernel.at(kernel.parameters())):
+        assert torch.allclose(again.gram(both), kernel.gram(both))
+        assert again.amplitude == 20

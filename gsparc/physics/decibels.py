@@ -1,0 +1,31 @@
+"""Powers in decibels, and back."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Powers = TypeVar("Powers", np.ndarray, Tensor)
+RELATIVE_DB = 10 / math.log(10)  # decibels of a small relative change of a power
+
+
+def to_decibels(power: Powers) -> Powers:
+    """Return levels (...) [dB] of powers (...).
+
+    >>> to_decibels(np.array([1.0, 100.0]))
+    array([ 0., 20.])
+    """
+    return 10 * (torch.log10(power) if isinstance(power, Tensor) else np.log10(power))
+
+
+def from_decibels(level: Powers) -> Powers:
+    """Return powers (...) of levels (...) [dB].
+
+    >>> from_decibels(np.array([0.0, 20.0]))
+    array([  1., 100.])
+    """
+    return 10 ** (level / 10)
