@@ -12,8 +12,8 @@ from omegaconf import DictConfig
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
 from gsparc.apps.export.along.taps import Trajectory, write_taps
-from gsparc.apps.export.compile_model.blob import write_form
-from gsparc.apps.export.compile_model.make import FIGURES, compile_model
+from gsparc.apps.export.compiled.blob import write_form
+from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, plain
 from gsparc.data.files import whole_folder

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.errors import some
+from gsparc.data.errors import list_first
 from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -196,7 +196,7 @@ class PerStation(Method):
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         known, unheard = trained_stations(self.factory, data, fold)
-        names = some([stations.name[t] for t in np.flatnonzero(unheard)])
+        names = list_first([stations.name[t] for t in np.flatnonzero(unheard)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
             if not self.factory.both_ends and not joint:

@@ -58,14 +58,14 @@ def compose(*overrides: str, config: str = "train"):
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    from gsparc.models.registry import complete
+    from gsparc.models.registry import fill_defaults
 
     chosen = tuple(word for word in overrides if _chooses(word))
     composed = pickle.loads(_composed(config, *chosen))
     values = OverridesParser.create().parse_overrides([word for word in overrides if word not in chosen])
     ConfigLoaderImpl._apply_overrides_to_config(values, composed)
     if "model" in composed:
-        complete(composed.model)
+        fill_defaults(composed.model)
     return composed
 
 

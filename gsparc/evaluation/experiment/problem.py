@@ -20,7 +20,7 @@ from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import plain
 from gsparc.evaluation.experiment.done import measurements_hash
-from gsparc.models.powers.together.network import network_of
+from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import fill_defaults
 from gsparc.simulate.scenes.build import names_scene
 
@@ -91,7 +91,9 @@ class Problem:
     def network(self) -> bool:
         """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
         return (
-            self.kind == "rssi" and self.data.site.stations is not None and network_of(self.data) is not None
+            self.kind == "rssi"
+            and self.data.site.stations is not None
+            and find_sectors(self.data) is not None
         )
 
     @property

@@ -13,7 +13,7 @@ from scipy.linalg import eigh
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from gsparc.data.blocks import blocks
+from gsparc.data.blocks import row_blocks
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
@@ -254,7 +254,7 @@ def project_targets(
 ) -> tuple[np.ndarray, float]:
     """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
-    for part in blocks(targets):
+    for part in row_blocks(targets):
         rows = to_real(targets[part], kind) - mean
         scores[part] = result = rows @ axes.T
         beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gsparc.data.blocks import blocks
+from gsparc.data.blocks import row_blocks
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import to_real
@@ -19,7 +19,7 @@ class Mean(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         total = np.zeros(int(np.prod(self.shape)) * (2 if self.kind == "csi" else 1))
-        for part in blocks(targets):  # thousands of byte images never become floats at once
+        for part in row_blocks(targets):  # thousands of byte images never become floats at once
             total += to_real(targets[part], self.kind).sum(0, dtype=np.float64)
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()

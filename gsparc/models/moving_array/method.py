@@ -32,8 +32,8 @@ from gsparc.models.moving_array.triangulate import (
     site_problem,
 )
 from gsparc.models.target_rows import heard_rows, to_real, training_targets
-from gsparc.physics.fit_separable import Separable, fit_separable
 from gsparc.physics.lags import BLOCK, SpectrumLags
+from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget

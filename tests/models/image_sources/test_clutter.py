@@ -243,7 +243,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
         find_small_mirrors(replace(left, room=room, scene=left.scene.only([0, 1])), 3)
     count = sum(planes for planes, _ in cells) * math.prod(
-        finite_mirrors._cells(room, finite_mirrors.tangents(WALLS[0]), cells[0][1])
+        finite_mirrors._cells(room, plane_tangents(WALLS[0]), cells[0][1])
     )
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
 

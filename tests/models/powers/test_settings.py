@@ -17,7 +17,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _in_doubt, fit_power_process
-from gsparc.models.reduce_method import reduce_method
+from gsparc.models.reduced import reduce_method
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
