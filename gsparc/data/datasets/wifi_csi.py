@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.wifi_logs import READERS, Packets, channel_hz, read_packets
+from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
 from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import read_csv
-from gsparc.data.limits import choice
+from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ KEPT_DB = 2.0  # between the channel's power and RSSI, less a constant: the leve
 def read_wifi_csi(
     path: str | Path,
     places: str | Path | None = None,
+    card: str | None = None,
     chip: str = CHIPS[0],
     carrier_hz: float | None = None,
     transmitters: Mapping[str, Sequence[float]] | None = None,
@@ -47,7 +48,7 @@ def read_wifi_csi(
     Args:
         path: a log, or a folder of them.
         places: the table of places; None: places.csv beside the logs.
-        chip: of Nexmon: `4339`, `43455c0`, `4358` or `4366c0`.
+        card, chip: see `read_packets`.
         carrier_hz: where neither logs nor places say a channel.
         transmitters: places [m] of senders by their addresses; None: nobody knows them.
 
@@ -60,10 +61,11 @@ def read_wifi_csi(
         DataError: a log or a place is missing or damaged, or logs are not of one kind.
         SettingError: a setting that cannot be.
     """
+    or_null(choice(*READERS)).check("dataset.card", card)
     choice(*CHIPS).check("dataset.chip", chip)
     path = Path(path)
     table = _table(Path(places or (path if path.is_dir() else path.parent) / PLACES))
-    logs = [_placed(one, table, chip) for one in _logs(path)]
+    logs = [_placed(one, table, card, chip) for one in _logs(path, card)]
     logs = [one for one in logs if len(one.csi)]
     if not logs:
         raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
@@ -115,20 +117,22 @@ def _table(path: Path) -> pd.DataFrame:
         raise DataError(f"{path}: {error}; expected numbers in {', '.join(NUMBERS)}") from None
 
 
-def _logs(path: Path) -> list[Path]:
+def _logs(path: Path, card: str | None) -> list[Path]:
     if path.is_file():
         return [path]
-    for ending in READERS:  # tables may lie beside logs
-        found = [one for one in sorted(path.rglob("*")) if one.suffix.lower() == ending]
+    files = [one for one in sorted(path.rglob("*")) if one.name != PLACES]
+    endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)]
+    for ending in endings:  # tables may lie beside logs
+        found = [one for one in files if one.suffix.lower() == ending]
         if found:
             return found
-    raise DataError(f"{path}: no such log, or a folder without {', '.join(READERS)}")
+    raise DataError(f"{path}: no such log, or a folder without {', '.join(endings)}")
 
 
-def _placed(path: Path, table: pd.DataFrame, chip: str) -> Packets:
+def _placed(path: Path, table: pd.DataFrame, card: str | None, chip: str) -> Packets:
     """Packets of a log whose places are known; how many are left out is logged."""
     at = table[table["file"].isin([path.name, path.stem])] if "file" in table else table
-    packets = read_packets(path, chip)
+    packets = read_packets(path, card, chip)
     time = packets.time_s
     if "time_s" in at:
         at = at.sort_values("time_s")

@@ -1,4 +1,4 @@
-"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300.
+"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; ESP32 on no log of a card yet.
 
 `csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
 file that is not there ends the process. So lengths are looked at before it reads.
@@ -16,6 +16,7 @@ import numpy as np
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
 from gsparc.data.errors import DataError, explain_error
 
+SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}
 HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
 TONES_40 = np.array([*range(-58, 0, 4), *range(2, 59, 4)])  # of 128 that it reports there
 STREAMS = 3  # most antennas at either end of the cards
@@ -50,11 +51,12 @@ class Packets:
     position: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
-def read_packets(path: Path, chip: str = "43455c0") -> Packets:
+def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> Packets:
     """Read the packets of a log.
 
     Args:
-        path: *.pcap of Nexmon, or *.dat of an Intel 5300.
+        path: *.pcap of Nexmon, *.dat of an Intel 5300, or what `card` names.
+        card: `nexmon`, `intel` or `esp32`; None: by the file's ending.
         chip: of Nexmon: `4339`, `43455c0`, `4358` or `4366c0`.
 
     Raises:
@@ -64,11 +66,11 @@ def read_packets(path: Path, chip: str = "43455c0") -> Packets:
         import csiread
     except ImportError:
         raise DataError(f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'") from None
-    if path.suffix.lower() not in READERS:
-        raise DataError(f"{path}: expected a log of Nexmon, *.pcap, or of an Intel 5300, *.dat")
-    card, read = READERS[path.suffix.lower()]
+    card = card or SUFFIXES.get(path.suffix.lower())
+    if card not in READERS:
+        raise DataError(f"{path}: no log of a known card; say dataset.card={'|'.join(READERS)}")
     try:
-        packets = read(path, csiread, chip)
+        packets = READERS[card](path, csiread, chip)
     except DataError:
         raise
     except Exception as error:  # `csiread` raises anything
@@ -156,4 +158,13 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     )
 
 
-READERS = {".pcap": ("Nexmon", _nexmon), ".dat": ("an Intel 5300", _intel)}
+def _esp32(path: Path, csiread: Any, _: str) -> Packets:
+    log = csiread.ESP32(str(path), if_report=False)
+    log.read()
+    tone = np.fft.fftfreq(64, 1 / 64).round().astype(int)  # of the legacy training field, which comes first
+    carrier = channel_hz(int(log.channel[0]))
+    csi = log.csi[:, None, :64]
+    return Packets(1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier)
+
+
+READERS = {"nexmon": _nexmon, "intel": _intel, "esp32": _esp32}

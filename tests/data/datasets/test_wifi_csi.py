@@ -77,13 +77,29 @@ def test_packets_of_an_intel_5300_along_a_track(robot):
     assert np.ptp(plain["time_s"]) == pytest.approx(np.ptp(raw["time_s"]), abs=0.01)
 
 
-def test_a_packet_of_zeros_made_all_levels_nan(robot, caplog):
-    records = np.frombuffer(robot.read_bytes(), RECORD).copy()
-    records["csi"][2] = 0
-    robot.write_bytes(records.tobytes())
-    raw = read_wifi_csi(robot, robot.with_name("way.csv"), carrier_hz=CARRIER).arrays
-    assert len(raw["csi"]) == len(records) - 1 and np.isfinite(raw["csi"]).all()
-    assert "1 packets" in caplog.text
+def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
+    rng = np.random.default_rng(0)
+    parts = rng.integers(20, 90, (5, 128))
+    parts[:, 20:22] = 0  # subcarrier 10
+    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
+    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
+    (tmp_path / "walk.csv").write_text("".join(lines))
+    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
+    raw = read_wifi_csi(tmp_path).arrays
+    assert raw["frequency_hz"].mean() == pytest.approx(2.437e9, abs=SPACING_HZ)
+    tone = ((raw["frequency_hz"] - 2.437e9) / SPACING_HZ).round()
+    assert len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
+
+
+def test_a_packet_of_zeros_made_all_levels_nan(tmp_path, caplog):
+    parts = np.random.default_rng(0).integers(20, 90, (5, 128))
+    parts[2] = 0
+    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
+    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
+    (tmp_path / "walk.csv").write_text("".join(lines))
+    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
+    raw = read_wifi_csi(tmp_path).arrays
+    assert len(raw["csi"]) == 4 and np.isfinite(raw["csi"]).all() and "1 packets" in caplog.text
 
 
 def test_logs_that_are_none(robot, tmp_path, refused, monkeypatch):
@@ -99,11 +115,10 @@ def test_logs_that_are_none(robot, tmp_path, refused, monkeypatch):
     refused("say dataset.carrier_hz", read_wifi_csi, robot)
     sound = standard(robot.read_bytes())
     robot.write_bytes(b"\xff\xf0" + sound[2:])  # longer than the buffer of csiread
-    refused("byte 0: a record of 65520 bytes", read_wifi_csi, robot, None, "43455c0", CARRIER)
+    refused("byte 0: a record of 65520 bytes", read_wifi_csi, robot, None, None, "43455c0", CARRIER)
     robot.write_bytes(b"")
-    refused("no packet with a channel in it", read_wifi_csi, robot, None, "43455c0", CARRIER)
-    capture = robot.rename(robot.with_suffix(".pcap"))
-    refused("expected those of one of 20, 40, 80 MHz", read_wifi_csi, capture)
+    refused("no packet with a channel in it", read_wifi_csi, robot, None, None, "43455c0", CARRIER)
+    refused("expected those of one of 20, 40, 80 MHz", read_wifi_csi, robot, None, "nexmon")
     refused("no such log", read_wifi_csi, tmp_path / "absent", table)
     monkeypatch.setitem(sys.modules, "csiread", None)
-    refused("pip install 'gsparc\\[wifi\\]'", read_wifi_csi, capture)
+    refused("pip install 'gsparc\\[wifi\\]'", read_wifi_csi, robot)
