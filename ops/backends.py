@@ -28,7 +28,7 @@ def choose_backend(name: str | None, device: torch.device) -> ModuleType:
 def backend_named(name: str) -> ModuleType:
     """Return the backend called `name` (BackendUnavailable, ValueError).
 
-    >>> named("tpu")
+    >>> backend_named("tpu")
     Traceback (most recent call last):
         ...
     ValueError: backend is 'reference', 'cpu' or 'cuda', got 'tpu'

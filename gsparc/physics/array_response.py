@@ -68,7 +68,7 @@ def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
 def normalise_spectrum(image: Tensor, how: str) -> Tensor:
     """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1) or `none`.
 
-    >>> normalised(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")
+    >>> normalise_spectrum(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")
     tensor([[0.0000, 0.2500, 1.0000]])
 
     Raises:

@@ -75,7 +75,7 @@ def image_rotations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Re
     One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.
     Soc. Am. 65 (1979)); a sequence is their product, the first plane rightmost.
 
-    >>> orientations(torch.tensor([[0.0, 0.0, 1.0, 2.0]]), [(0,)])[0].diagonal()  # z turns round
+    >>> image_rotations(torch.tensor([[0.0, 0.0, 1.0, 2.0]]), [(0,)])[0].diagonal()  # z turns round
     tensor([ 1.,  1., -1.])
     """
     ends = torch.cat([torch.zeros(1, 3, dtype=planes.dtype), torch.eye(3, dtype=planes.dtype)])

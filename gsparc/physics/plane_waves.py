@@ -43,7 +43,7 @@ class Aperture:
 def planar_places(array: np.ndarray, wavelength: float) -> Tensor:
     """Return antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes.
 
-    >>> flat_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()  # about the middle
+    >>> planar_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()  # about the middle
     tensor([1., 1.])
     """
     centred = (array - array.mean(axis=0)) / wavelength
@@ -124,7 +124,7 @@ def mean_delay(snapshot: Tensor) -> Tensor:
     """Return the mean delay (B,) [turns per tone], by power, of snapshots (B, A, K), from neighbouring tones.
 
     >>> aperture = Aperture(torch.zeros(1, 2), torch.arange(4.0))
-    >>> mean_delay(delays(torch.tensor([[0.1]]), aperture))  # one path, as (B, 1, K)
+    >>> mean_delay(tone_responses(torch.tensor([[0.1]]), aperture))  # one path, as (B, 1, K)
     tensor([0.1000])
     """
     # From one tone to the next a path turns by -2 pi times its delay; the sum weighs paths by their power.

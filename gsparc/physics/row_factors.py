@@ -21,7 +21,7 @@ AT_ONCE = 4_096  # rows whose delays are tried together: memory
 def freedom_words(freedom: Freedom) -> str:
     """Say in words what is free, for messages: `a phase and a delay`.
 
-    >>> words("phase+delay+gain")
+    >>> freedom_words("phase+delay+gain")
     'a phase, a delay and a gain'
     """
     parts = [f"a {part}" for part in freedom.split("+")]
@@ -31,7 +31,8 @@ def freedom_words(freedom: Freedom) -> str:
 def resolvable_delays(tones: np.ndarray) -> np.ndarray:
     """Return delays (T,) [s] that tones (K,) [Hz] tell apart, evenly spaced about 0.
 
-    >>> len(delays(np.array([0.0, 1e6, 2e6]))), float(delays(np.array([0.0, 1e6, 2e6]))[-1])
+    >>> delays = resolvable_delays(np.array([0.0, 1e6, 2e6]))
+    >>> len(delays), float(delays[-1])
     (17, 5e-07)
     """
     tones = np.sort(tones)
@@ -52,7 +53,7 @@ def alignment_factors(
     The delay is the largest of the correlation over tones, between samples by a parabola.
 
     >>> reference = np.ones((1, 2, 8), complex)  # of one row: two antennas, eight tones
-    >>> factor = turning(1j * reference, reference, np.arange(8) * 1e6, "phase")
+    >>> factor = alignment_factors(1j * reference, reference, np.arange(8) * 1e6, "phase")
     >>> bool(np.allclose(factor[:, None] * 1j * reference, reference))
     True
 

@@ -47,7 +47,7 @@ class Separable:
 def fit_separable(blocks: Iterable[Tensor], lost: float) -> Separable:
     """Find the basis in which each mode of images loses at most the share `lost` of their energy.
 
-    >>> basis = separable([torch.ones(5, 3, 4)], lost=1e-6)  # five equal images of 3 x 4 pixels
+    >>> basis = fit_separable([torch.ones(5, 3, 4)], lost=1e-6)  # five equal images of 3 x 4 pixels
     >>> basis.rows.shape, basis.columns.shape
     (torch.Size([3, 1]), torch.Size([1, 4]))
 

@@ -41,7 +41,7 @@ def test_cells_near_trained_places():
 def test_cells_where_a_plan_is_open():
     left = cover_box(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
     assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
-    with pytest.raises(ValueError, match="stand nowhere"):
+    with pytest.raises(ValueError, match="no open floor"):
         cover_box(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
 
 
