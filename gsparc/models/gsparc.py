@@ -57,7 +57,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         )
         kind = next(kind for called, kind in table if called)
         if settings.own_terms and kind is not Powers:
-            raise ValueError(f"model.terms are of received powers; model={kind.name} is called for here")
+            raise ValueError(f"model.terms are of received powers; the target is {site.kind} here")
         rendered = issubclass(kind, ImageProcess)
         if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"

@@ -15,7 +15,7 @@ from gsparc.data.schema import Links
 from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
-NOT_HEARD = "powers were not heard: below sensitivity_db"
+NOT_HEARD = "powers were not heard: they lie below sensitivity_db, or the weakest of their list"
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
 

@@ -105,7 +105,7 @@ def fit_folds(
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Method, FitReport], None] | None = None,
 ) -> FoldFits:
-    """Fit an unfitted method on every fold; `Outcome.with_scores` scores them together.
+    """Fit an unfitted method on every fold; `FoldFits.with_scores` scores them together.
 
     Args:
         factory: an unfitted method, or what chooses one.

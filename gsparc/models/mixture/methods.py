@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
+from gsparc.data import heeded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate
@@ -71,6 +72,7 @@ class Powers(Mixture):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
+        heeded.count(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
         return super().fit(data, fold, replace(context, terms=self.own_terms))
 
     def tries(self, data: Measurements) -> Mapping[str, Candidate]:

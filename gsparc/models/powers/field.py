@@ -88,7 +88,7 @@ class PowerField(ClosedForm):
         self.condition(data, rows)
         own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
-            notes = (*notes, *describe_weights(self.powers.posterior, own))
+            notes = (*describe_weights(self.powers.posterior, own), *notes)
         return FitReport(budget.counted.wall, notes, budget.limited_by)
 
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:

@@ -48,7 +48,11 @@ class UserTerm(Columns):
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`; of places of the moving end (n, 3), or of both (n, 6), in local coordinates."""
         both = places if of_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
-        return self.term.columns(both + torch.cat([self.origin, self.origin]))
+        result = self.term.columns(both + torch.cat([self.origin, self.origin]))
+        if not isinstance(result, Tensor):
+            gave = f"{type(self.term).__name__}.columns gave {type(result).__name__}"
+            raise ValueError(f"{gave}; a torch tensor ({len(places)}, Q) is needed")
+        return result
 
     def check(self, places: Tensor) -> None:
         """Raise `ValueError` where columns at places (n, D) [m] have another shape or are not finite."""

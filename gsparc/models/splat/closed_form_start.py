@@ -96,7 +96,7 @@ class ImageEmissions:
     attenuation: Tensor | None
 
     def at(self, rows: np.ndarray) -> ImageEmissions:
-        """Return the process of some rows (m,) alone."""
+        """Return the emissions of some rows (m,) alone."""
         attenuation = None if self.attenuation is None else self.attenuation[rows]
         return ImageEmissions(self.weights, self.images[rows], self.outputs[rows], attenuation)
 

@@ -1,6 +1,7 @@
 """A term of a user's own, of examples/own-term: learned, stored, read back, refused."""
 
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from omegaconf import OmegaConf
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
+from gsparc.evaluation.summary import describe_model
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.processes import stored, term, trend
@@ -86,6 +88,9 @@ def test_a_term_needs_both_ends_and_powers(trees):
     with pytest.raises(ValueError, match=r"model\.terms are of received powers"):
         csi = np.ones((40, 1, 1), complex)
         gsparc.fit(rx=data["rx"], tx=STILL, csi=csi, frequency_hz=[1e9], terms=trees(GROVE))
+    with pytest.raises(ValueError, match=r"model\.terms are of received powers; the target is spectrum"):
+        images = np.random.default_rng(0).uniform(size=(40, 8, 16))
+        gsparc.fit(tx=data["rx"], rx=STILL, spectrum=images, terms=trees(GROVE))
 
 
 def test_what_is_no_term_is_refused():
@@ -103,6 +108,13 @@ def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
     own = {"terms": Flat(GROVE)}  # one alone needs no list
     with pytest.raises(ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"):
         gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings=own)
+
+    class Arrays(trees):
+        def columns(self, places):
+            return super().columns(places).numpy()
+
+    with pytest.raises(ValueError, match=r"Arrays\.columns gave ndarray; a torch tensor"):
+        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], terms=Arrays(GROVE))
 
 
 def test_a_term_may_have_the_name_of_one_of_ours():
@@ -127,6 +139,9 @@ def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
     log = (folder / "train.log").read_text()
     said = re.search(r"Trees: (\S+) \+- (\S+)", log)
     assert said and abs(float(said[1]) + 4.0) < 3 * float(said[2])  # a unit is ten metres: .4 dB each
+    assert "options without effect" not in log, "a term that was learned was said to be ignored"
+    shown = describe_model(json.loads((folder / "summary.json").read_text()))
+    assert any("Trees: " in line for line in shown), "lines of lengths hid what was learned"
     assert gsparc.load(folder / "model.ckpt").rssi(rx=data["rx"]).shape == (60, 1)
 
 
