@@ -19,12 +19,18 @@ from uuid import uuid4
 import numpy as np
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.metric_formats import CALIBRATION, DECIDING, TABLES, form_of, score_of
+from gsparc.evaluation.metric_formats import (
+    CALIBRATION,
+    TABLES,
+    WITH_SILENT,
+    deciding_figure,
+    form_of,
+    score_of,
+)
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
-WITH_SILENT = "rmse_db_with_silent"
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 MOST_LEARNED = 3  # notes of a fit below the table; the log has all
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
@@ -184,7 +190,7 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return the baseline that beats the method, if one does; where rows were silent, these count too."""
-    figure = WITH_SILENT if f"{prefix}/{WITH_SILENT}" in facts else DECIDING[facts["dataset/kind"]]
+    figure = deciding_figure(facts, prefix)
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
     known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}

@@ -12,7 +12,7 @@ import pandas as pd
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.metric_formats import CALIBRATION, form_of, heading_of
+from gsparc.evaluation.metric_formats import CALIBRATION, DECIDING, WITH_SILENT, form_of, heading_of
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import BUSY
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
@@ -52,7 +52,8 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
     rows = []
     for one in filled:
         own = one.row
-        second, label = SECOND[own["kind"]], str(own["label"] or "")
+        second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
+        label = str(own["label"] or "")
         rows.append({
             **own, **asdict(one.cell), "draws": one.drawn, "score_db": score_db(own), "second": second,
             "second_value": own.get(second), **{name: own.get(key) for name, key in BESIDE.items()},
@@ -160,14 +161,15 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     rows = list(block.itertuples())
     first = rows[0]
     lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
-    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
-        lines.append(f"a simple baseline wins: take {first.method} for this data and split")
     own = next((row for row in rows if row.method == ours), None)
+    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
+        wins = f"a simple baseline wins: take {first.method} for this data and split"
+        lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         # Independent errors add in squares.
         spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
-        level = own.score_db >= first.score_db - spread
+        level = own.score_db >= first.score_db - spread and own.seeds > 1
         lines.append(gap + (", within the seeds' spread" if level else ""))
     # False for NaN: methods without a variance have no such figure.
     if own is not None and first.outage > own.outage:
