@@ -135,11 +135,11 @@ INTERRUPTED = """
 import sys, time
 from gsparc.data import executor
 if __name__ == "__main__":
-    executor.use(executor.Engine(sys.argv[1], 2))
-    list(executor.each(abs, [1, 2]))
+    executor.use_engine(executor.Engine(sys.argv[1], 2))
+    list(executor.run_each(abs, [1, 2]))
     print("begun", flush=True)
     try:
-        list(executor.each(time.sleep, [60, 60, 60, 60]))
+        list(executor.run_each(time.sleep, [60, 60, 60, 60]))
     except KeyboardInterrupt:
         print("interrupted", flush=True)
         sys.exit(130)
