@@ -7,7 +7,7 @@ from pathlib import Path
 import cities
 import numpy as np
 import pytest
-from campaigns import channels, powers, spectra
+from campaigns import powers
 from releases import write_release
 
 from gsparc.data.checks.describe import describe
@@ -49,8 +49,6 @@ def argos(folder: Path, change) -> Path:
 
 DOORS = {  # readers of the schema's arrays, a room's, a simulator's or a table's, share one way
     "argos": argos,
-    "own spectra": own(spectra),
-    "own channels": own(channels),
     "own powers": own(powers),
     "rfid": rfid,
 }

@@ -60,7 +60,6 @@ OF_THREE = [
     for (x, y), row in zip(PLACES, LEVELS, strict=True)
     for name, v in zip("abc", row, strict=True)
 ]
-THREE = "\n".join(["station,x,y,rssi", *OF_THREE])
 
 # name: content, settings, what `check` must say, what it must not.
 CASES = {
@@ -167,12 +166,6 @@ def test_saturated_levels_were_learned_and_scored_as_measured(write):
         above = LEVELS[:, 0] >= least
         assert (data.censored == np.where(above, -1, 0)).all() and (data.mask[:, 0] == ~above).all()
     np.testing.assert_allclose(level, np.minimum(LEVELS[:, 0], -76), atol=1e-3)
-
-
-@pytest.mark.parametrize("setting", ["full", 900])
-def test_a_level_of_saturation_that_is_none_is_refused(write, setting):
-    found = said(write(long("t", range(ROWS))), saturation_db=setting)
-    assert f"dataset.saturation_db={setting!r}: a number of at least -400 and at most 400" in found
 
 
 def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):

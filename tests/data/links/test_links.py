@@ -47,14 +47,6 @@ def test_a_wide_file_is_a_row_for_each_link():
     )
 
 
-def test_a_long_file_is_the_same_measurements():
-    one, other = read(town(**LONG, rssi_db=LEVELS.reshape(-1))).data, read(town()).data
-    np.testing.assert_array_equal(one.station, other.station)
-    np.testing.assert_array_equal(one.target, other.target)
-    first = np.unique(one.place, return_index=True)[1]
-    assert len(first) == PLACES
-
-
 def test_three_access_points_by_their_positions_alone():
     """One end at three places was refused: both ends move."""
     rows = 60
