@@ -95,17 +95,6 @@ def test_thinned_rows_are_not_thinned_again():
     assert all(len(f.train) + len(f.val) == 0.8 * 180 for f in inner.folds)
 
 
-@pytest.mark.parametrize("name", ["random", "blocks"])
-def test_a_place_visited_again_is_left_out_whole(name):
-    places = floor(200)
-    place = np.repeat(np.arange(200), 3)
-    positions, settings = places[place], settings_of(name)
-    outer = make_split(positions, settings, place=place).folds[0]
-    for fold in inner_folds(positions, outer, settings, 3, 0, place).folds:
-        assert not np.isin(place[fold.test], place[np.union1d(fold.train, fold.val)]).any()
-        assert not np.isin(place[fold.val], place[fold.train]).any()
-
-
 @pytest.mark.parametrize("together", [0, 2])
 def test_whole_stations_are_left_out(together):
     station = np.repeat(np.arange(8), 30)

@@ -1,8 +1,6 @@
 """Layouts of measured campaigns: what is read and measured, and what is refused with array and row."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-import logging
-
 import numpy as np
 import pytest
 from measured import (
@@ -140,20 +138,6 @@ def test_values_that_were_never_written_are_none(tmp_path):
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
-def equal(one: np.ndarray, other: np.ndarray) -> bool:
-    if one.dtype.kind == "f":
-        return np.allclose(one, other, rtol=0, atol=1e-9, equal_nan=True)
-    return np.array_equal(one, other)
-
-
-def test_powder_csv_holds_the_same(tmp_path):
-    table, npz = read_powder(write_walk(tmp_path)), read_powder(write_npz(tmp_path, "powder"))
-    assert all(equal(table.arrays[name], npz.arrays[name]) for name in npz.arrays)
-    assert np.isnan(table.arrays["rssi_db"]).sum() == 2  # -101 in the release
-    assert table.arrays["row_name"][0] == "line 2"
-    assert "3 columns left out, no fixed place: bus-6186_rss" in table.attributes["left_out"]
-
-
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
     raw = read_powder(
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
@@ -203,21 +187,6 @@ def test_absent_damaged_and_foreign_files(tmp_path, refused, name):
     refused("damaged or not an npz", LOADERS[name], path)
     foreign = write_npz(tmp_path, "ble" if name == "techtile" else "techtile")
     refused("position: missing", LOADERS[name], foreign)
-
-
-def test_techtile_is_links_to_antennas(tmp_path, caplog):
-    with caplog.at_level(logging.INFO):
-        data = load({"name": "techtile", "file": str(write_release(tmp_path))})
-    stations, arrays = data.site.stations, read_techtile(tmp_path / "csi.nc").arrays
-    assert data.site.kind == "csi" and data.site.static_end == "rx" and data.site.carrier_hz == 920e6
-    assert np.allclose(stations.position + data.site.origin, ANTENNAS) and stations.name == tuple(HOSTS)
-    assert len(data) == arrays["mask"].sum() and data.target.shape == (len(data), 1, 1)
-    links = arrays["csi"][data.place, data.station]
-    assert np.allclose(data.target[:, 0, 0] * data.site.target_scale, links, rtol=1e-5)
-    assert np.allclose(data.moving + data.site.origin, arrays["tx_position"][data.place])
-    runs = arrays["run"][data.place]
-    assert len(set(zip(runs, data.run, strict=True))) == 2
-    assert "1 of 15 cycles left out: no position" in caplog.text
 
 
 @pytest.mark.parametrize("form", ["npz", "csv"])
