@@ -61,6 +61,8 @@ OF_THREE = [
     for name, v in zip("abc", row, strict=True)
 ]
 
+DROPS = [-50 - np.arange(ROWS) % 3 - 40 * (np.arange(ROWS) == 100 + i) for i in range(12)]
+
 # name: content, settings, what `check` must say, what it must not.
 CASES = {
     "a mark far below": (wide(-999), {}, "exactly -999, apart from all others: taken as not heard", ""),
@@ -124,20 +126,8 @@ CASES = {
     "losses": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]), {}, "rssi_db=path_loss*-1 takes losses", ""),
     "losses that are said": (table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),
         {"columns": {"rssi_db": "path_loss*-1"}}, "good", "warning"),
-    "many of a kind": (
-        "\n".join(
-            [
-                ",".join(["x", "y", *(f"AP{i}" for i in range(12))]),
-                *(
-                    ",".join([f"{x},{y}", *(str(-50 - 40 * (n == 100 + i) - n % 3) for i in range(12))])
-                    for n, (x, y) in enumerate(PLACES)
-                ),
-            ]
-        ),
-        {},
-        "(and 11 more warnings of this kind)",
-        "station AP7",
-    ),
+    "many of a kind": (table(",".join(["x", "y", *(f"AP{i}" for i in range(12))]), *PLACES.T, *DROPS), {},
+        "(and 11 more warnings of this kind)", "station AP7"),
 }  # fmt: skip
 
 
