@@ -75,6 +75,7 @@ CSI = {
     "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),
                              _set("rx_position", np.ones((1, 3)))), "two rows or more"),
     "transposed": (_set("rx_position", np.ones((3, 12))), r"found \(3, 12\); transposed"),
+    "quaternions transposed": (_set("rx_orientation", np.ones((4, 12))), r"found \(4, 12\); transposed"),
     "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
     "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
     "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),

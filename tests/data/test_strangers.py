@@ -173,6 +173,7 @@ def test_absent_links_are_silent_only_where_somebody_says_so(write):
     unknown, silent = read_any(path).data, read_any(path, absent="silent").data
     assert unknown.censored is None and len(silent) == 2 * ROWS
     assert silent.censored.sum() == ROWS // 2
+    assert len(np.unique(np.c_[silent.moving, silent.station], axis=0)) == 2 * ROWS
 
 
 def channels() -> dict[str, np.ndarray]:

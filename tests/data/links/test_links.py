@@ -105,6 +105,7 @@ def test_the_mask_wins_over_the_sensitivity():
 def test_the_files_own_split_names_rows_of_the_file():
     data = read(town(split_train=np.arange(8), split_test=np.array([8, 9]))).data
     np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
+    assert data.subset(np.arange(6)).release_split is None  # its rows are numbered otherwise
 
 
 def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
