@@ -68,12 +68,6 @@ def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
         interpolate_tones(response(tones), tones, centred_grid(float(tones.mean()), 30e3, 2400))
 
 
-def test_one_tone_is_flat() -> None:
-    assert torch.equal(
-        interpolate_tones(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
-    )
-
-
 def test_grid_is_sionna_s_order() -> None:
     channel = torch.arange(12.0).reshape(2, 3, 2)
     down = resource_grid(channel, 14, "rx")
@@ -196,25 +190,6 @@ def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
     bold, careful = (loop.rates(band, 0.01, care) for care in (0.0, 1.0))
     assert careful.chosen.mean() < bold.chosen.mean()
     assert bold.chosen_bps.mean() < careful.chosen_bps.mean() < careful.best_bps.mean()
-
-
-@needs_sionna
-@pytest.mark.slow
-def test_pusch_knows_who_knows_more() -> None:
-    draw = drawn()
-    torch.manual_seed(0)
-    true = draw(16, 1).expand(16, 48).contiguous()
-    error = draw(16, 48) * 0.6
-    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
-    pusch = Pusch("qpsk", 4, 30, known, iterations=8)
-    assert np.isclose(pusch.pilot_share, 2 / 14)
-    power = true.abs().square().mean(1, keepdim=True).sqrt()
-    band = Band(true, true + error * power, torch.full((16,), 0.36))
-    found = pusch.run(band, 3.0, np.arange(128) % 16, 64).groupby("receiver")
-    wrong, bits = found.failed.mean(), found.wrong.mean()
-    assert wrong["perfect"] <= wrong["lmmse"] + 0.05
-    assert wrong["predicted"] > wrong["perfect"] + 0.3
-    assert bits["perfect"] < bits["predicted"]
 
 
 @needs_sionna

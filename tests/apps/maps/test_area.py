@@ -30,13 +30,6 @@ def image(path):
     return path
 
 
-def test_a_rectangle_is_covered_by_square_cells():
-    grid = lay_grid(None, [0, 0, 4, 3], 1.5, 0.5)
-    assert grid.shape == (6, 8) and grid.inside.all() and grid.extent == (0.0, 4.0, 0.0, 3.0)
-    assert grid.places().shape == (48, 3) and (grid.places()[:, 2] == 1.5).all()
-    assert grid.places(np.array([8]))[0].tolist() == [0.25, 0.75, 1.5]
-
-
 def test_a_polygon_keeps_its_holes(tmp_path):
     grid = lay_grid(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
     assert grid.inside.sum() == 400 - 16

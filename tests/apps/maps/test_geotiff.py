@@ -72,15 +72,6 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
         predict_map(predictor, [11.3, 47.2, 11.301, 47.2008])
 
 
-def test_a_map_in_metres_has_no_projection(tmp_path):
-    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
-    found = predict_map(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
-    write_geotiff(tmp_path / "map.tif", found, None)
-    with rasterio.open(tmp_path / "map.tif") as file:
-        (value,) = next(file.sample([(found.grid.x[3], found.grid.y[5])], indexes=1))
-        assert file.crs is None and value == pytest.approx(found.at_best_server(found.power_db)[5, 3])
-
-
 def test_asked_for_without_rasterio(monkeypatch):
     monkeypatch.setattr("gsparc.apps.maps.field_map.find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs rasterio"):

@@ -9,7 +9,6 @@ from gsparc.apps.maps.intervals import (
     calibrate,
     cross_validate,
     interval_coverage,
-    nearest_distances,
 )
 
 
@@ -44,13 +43,6 @@ def test_width_rises_with_distance_and_ends():
     assert np.isfinite(half).all() and half[-1] > 1.2 * half[0]
     assert np.isnan(found.half_width(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
     assert np.isnan(found.expected_error(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
-
-
-def test_the_model_without_any_sense_of_distance_still_gets_wider():
-    known = evidence()
-    flat = Evidence(**{**vars(known), "spread_db": np.ones(len(known))})
-    half = calibrate(flat).half
-    assert (np.diff(half) >= -1e-12).all() and half[-1] > 1.3 * half[0]
 
 
 def test_each_station_holds_its_own_share():
@@ -89,9 +81,3 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
 def test_too_little_evidence_promises_nothing():
     with pytest.raises(ValueError, match="too few rows to test intervals"):
         calibrate(evidence(LEAST_ROWS - 1))
-
-
-def test_distance_is_to_rows_of_the_same_station():
-    known, station = np.array([[0.0, 0, 0], [10, 0, 0]]), np.array([0, 1])
-    places = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert nearest_distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]

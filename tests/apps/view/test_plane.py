@@ -1,7 +1,5 @@
 """Planes of power: coarse first, exact at the end."""
 
-from dataclasses import replace
-
 import numpy as np
 from campaigns import channels
 from towns import trained
@@ -26,15 +24,6 @@ def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     second = weakest_place(planes[-1], [first])
     assert np.linalg.norm(second - first) >= 0.1 * max(grid.shape) * grid.step
     assert weakest_place(planes[-1], grid.places()) is None
-
-
-def test_a_lifted_plane_is_asked_at_its_height(power_view):
-    asked = power_view.viewed.predictor_of(power_view.viewed.stations[0])
-    high = replace(power_view.grid, height=6.0)
-    *_, plane = refine_plane(asked, high)
-    assert (high.places()[:, 2] == 6.0).all()
-    direct = asked.rssi(rx=high.places()).reshape(high.shape)
-    np.testing.assert_allclose(plane.level_db, direct, atol=1e-4)
 
 
 def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
