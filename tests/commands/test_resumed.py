@@ -1,10 +1,6 @@
 """What a training goes on from and starts from: an interrupt, a checkpoint, the weights of another."""
 
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,11 +180,6 @@ def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra
     assert predicted.shape == (20, 16, 32) and np.abs(predicted.numpy() - expected).max() < 1e-5
 
 
-def test_a_method_without_a_field_has_no_module(others):
-    with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
-        load_module(others["nearest"])
-
-
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     """The settings it did not name were the defaults, and each of them stood in the refusal."""
     stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"
@@ -205,19 +196,3 @@ def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     resumed = checkpoint.read(tmp_path / "on" / "model.ckpt").configuration
     assert resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
     assert resumed["seed"] == 0 and resumed["trainer"]["max_steps"] == 20
-
-
-@pytest.mark.slow
-def test_an_interrupted_process_ends_with_130_and_one_line(spectra_file, tmp_path):
-    run, often = tmp_path / "run", "callbacks.checkpoint.interval=10"
-    words = brief(spectra_file, "trainer.max_steps=100000", often, f"hydra.run.dir={run}")
-    process = subprocess.Popen(
-        [sys.executable, "train.py", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    until = time.monotonic() + 120
-    while not (run / "last.ckpt").exists() and time.monotonic() < until:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and f"go on with ckpt_path={run / 'last.ckpt'}" in err
-    assert "Traceback" not in err

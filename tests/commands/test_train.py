@@ -3,17 +3,12 @@
 import json
 import logging
 import os
-import re
-import subprocess
-import sys
-import traceback
 from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigns import FROZEN, brief, channels, compose, plain, short, spectra, weights
+from campaigns import brief, channels, compose, plain, short, spectra
 from doors import knock
-from lightning.pytorch import Trainer
 from omegaconf import open_dict
 
 import gsparc
@@ -70,22 +65,6 @@ def test_a_checkpoint_evaluates_to_the_same_figures(field):
     assert len(same) > 5 and all(found.facts[key] == facts[key] for key in same)
     image = gsparc.load(checkpoints[0]).spectrum(tx=[0.1, 0.2, 0.1])
     assert image.shape == (16, 32) and image.max() <= 1
-
-
-def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, monkeypatch):
-    called = []
-
-    def reached(*unused, **named):
-        stack = [one.name for one in traceback.extract_stack() if str(ROOT / "gsparc") in one.filename]
-        called.extend(name for name in stack if name != "<genexpr>")
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(Trainer, "fit", reached)
-    with pytest.raises(ZeroDivisionError):
-        train(short(spectra_file), tmp_path)
-    text = (ROOT / "ARCHITECTURE.md").read_text().partition("Calls down to the Trainer: ")[2]
-    named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
-    assert ["task", *called] == named
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):
@@ -178,16 +157,6 @@ def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_fil
     assert ("FIT Profiler Report" in caplog.text) == ("+trainer.profiler=simple" in options)
 
 
-@pytest.mark.slow
-def test_two_devices_learn_what_one_does(spectra_file, halfway, tmp_path):
-    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    facts, objects = train(short(spectra_file, *two), tmp_path)
-    assert steps(tmp_path) == [10, 20] and facts["time/train_s"] > 0  # written by one of them
-    _, untouched = train(short(spectra_file, "trainer.max_steps=1", *FROZEN), tmp_path / "start")
-    one, both, began = (weights(o.checkpoints[0])["gaussians.means"] for o in (halfway, objects, untouched))
-    assert (both - one).norm() < 0.2 * (one - began).norm()  # the same mean gradient, but for rounding
-
-
 def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monkeypatch):
     def absent(*unused, **named):
         raise ModuleNotFoundError("No module named 'tensorboard'")
@@ -232,19 +201,3 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
 
 
 # -- the command itself ---------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(spectra_file, tmp_path):
-    drawn = "+callbacks.drawn._target_=gsparc.callbacks.Pictures"
-    words = brief(spectra_file, "logger=wandb", drawn, f"hydra.run.dir={tmp_path / 'run'}")
-    done = subprocess.run([sys.executable, "train.py", *words], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
-    (stored,) = folder.glob("*.wandb")
-    names = (b"train/loss", b"val/psnr_db", b"model/num_gaussians", b"rate/", b"final/test/psnr_db")
-    assert all(name in stored.read_bytes() for name in names)
-    media = folder / "files" / "media"
-    assert list(media.glob("images/test rows*.png")) and list(media.glob("images/predictions*.png"))
-    (table,) = (json.loads(file.read_text()) for file in media.glob("table/results*.json"))
-    assert table["columns"][0] == "method" and "gsparc" in [row[0] for row in table["data"]]

@@ -58,8 +58,3 @@ def test_a_wall_apart_from_all_places_was_beside_the_map(room, monkeypatch):
     apart = np.array([[1.0, 0, 0, 25.0], [1.0, 0, 0, 900.0]])
     axis = drawn(monkeypatch, room, SiteObjects.of(apart)).axes[0]
     assert 25 < axis.get_xlim()[1] - room.site.origin[0] < 60
-
-
-def test_objects_of_two_stations_stand_in_one_site():
-    both = SiteObjects.of(PLANES).joined(SiteObjects.of(boxes=BOX))
-    assert len(both) == 3 + 1

@@ -58,17 +58,6 @@ def test_static_end_is_known_and_not_moved(spectra):
         predictor.spectrum(tx=world, rx=still + 1)
 
 
-def test_far_from_the_origin(campaign, folds, tmp_path):
-    near = campaign("spectrum", 40)
-    here = loaded(near, folds(40).folds[0], tmp_path)
-    shift = np.array([1e5, -2e5, 3e4])
-    predictor = gsparc.Predictor(
-        here.method, type(near.site)(**{**vars(near.site), "origin": near.site.origin + shift})
-    )
-    world = near.tx[:4] + near.site.origin
-    assert np.allclose(predictor.spectrum(tx=world + shift), here.spectrum(tx=world), atol=1e-5)
-
-
 def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_path):
     data = campaign("csi", 40, "tx")
     predictor = loaded(data, folds(40).folds[0], tmp_path, "nearest")
@@ -104,12 +93,6 @@ def test_wrong_questions_get_clear_answers(spectra, folds, tmp_path):
         spectra[1].csi(tx=HERE)
     with pytest.raises(ValueError, match="mean has no confidence"):
         loaded(spectra[0], folds(40).folds[0], tmp_path, Mean.name).confidence(tx=HERE)
-
-
-def test_names_are_looked_up_on_first_use():
-    assert "load" in dir(gsparc)
-    with pytest.raises(AttributeError, match="lod"):
-        gsparc.lod  # noqa: B018
 
 
 def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):

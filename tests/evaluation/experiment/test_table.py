@@ -70,17 +70,6 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
-def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
-    there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
-    drawn = {"kind": "rssi", "drawn": True}
-    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
-    figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
-    pictures.draw_splits(found, tmp_path / "city.png")
-    texts = [[text.get_text() for text in axis.texts] for axis in figures[0].axes]
-    assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
-
-
 def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
@@ -123,15 +112,6 @@ def test_what_an_earlier_program_measured_is_said():
     found = split_by_problem(average_cells([*FOUND[:1], old], {}))[0]
     assert list(found.earlier) == ["", "0123abcd"]
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
-
-
-def test_page_sheet_and_picture_show_every_method(tmp_path):
-    found = average_cells(FOUND, TIMED)
-    page = markdown(split_by_problem(found), "gsparc")
-    assert "### rfid, split random, 60 s of training per model" in page
-    assert "**29.50 ± 0.71**" in page and "| gsrf | 21.00 ± 1.41 | 0.9 |" in page
-    draw_budgets(found, tmp_path / "compare.png", "gsparc")
-    assert (tmp_path / "compare.png").stat().st_size > 10_000
 
 
 def test_how_a_method_approximates_stands_behind_its_name():
