@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from campaigns import FROZEN, brief, channels, compose, plain, short, spectra, weights
+from campaigns import FROZEN, brief, compose, plain, short, spectra, weights
 from doors import assert_refused, knock
 from lightning.pytorch import Trainer
 
@@ -136,8 +136,6 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("others")
     files = {
         "rx": spectra(folder / "rx.npz", moving="rx"),
-        "csi": channels(folder / "csi.npz"),
-        "far": spectra(folder / "far.npz", origin=100.0),
     }
     _, nearest = train(plain(spectra_file, "nearest"), folder / "nearest")
     return files | {"model": halfway.checkpoints[0], "nearest": nearest.checkpoints[0]}
@@ -152,8 +150,6 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
         (["ckpt_path=gone.ckpt"], r"gone\.ckpt: no such file"),
         (["init_from=none.ckpt"], r"init_from=none\.ckpt: .*no such checkpoint"),
         (["init_from={model}", "dataset.file={rx}"], "init_from=.*trained with static_end rx"),
-        (["init_from={model}", "dataset.file={csi}"], "init_from=.*trained with kind spectrum"),
-        (["init_from={model}", "dataset.file={far}"], "init_from=.*from the model's"),
         (["init_from={model}", "model=nearest"], "init_from: nearest takes no weights to start from"),
         (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
     ],

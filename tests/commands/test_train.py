@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigns import brief, channels, compose, plain, short, spectra
+from campaigns import brief, compose, plain, short
 from doors import knock
 from lightning.pytorch.loggers import CSVLogger
 
@@ -23,19 +23,14 @@ from gsparc.training import curve
 ROOT = Path(__file__).parents[2]
 
 
-KINDS = {"spectrum": spectra, "csi": channels}  # powers: tests/grid
-
-
 def steps(folder: Path) -> list[int]:
     """Those that a learning curve has rows of, after the start."""
     return [int(row["step"]) for row in curve.read(folder) if row["what"].startswith("step ")]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_run_leaves_facts_and_files(kind, tmp_path):
+def test_a_run_leaves_facts_and_files(spectra_file, tmp_path):
     """What `evaluate` finds, and beside it what a training alone knows."""
-    file = KINDS[kind](tmp_path / "own.npz")
-    facts, objects = train(compose(*brief(file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
+    facts, objects = train(compose(*brief(spectra_file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert {"seed", "git", "versions", "memory/peak_mb", "test/skill"} <= set(stored)
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
@@ -67,7 +62,7 @@ def test_a_checkpoint_evaluates_to_the_same_figures(field):
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):
-    config = short(spectra_file, "split=grouped", "split.folds=2", "split.buffer_m=0")
+    config = plain(spectra_file, "mean", "split=grouped", "split.folds=2", "split.buffer_m=0")
     facts, objects = train(config, tmp_path)
     assert [p.parent.name for p in objects.checkpoints] == ["fold0", "fold1"]
     assert facts["split/folds"] == 2 and facts["test/samples"] == 40
