@@ -53,6 +53,13 @@ def test_corridors_and_a_length(tmp_path, predictor):
     assert short.length_m <= 30 and len(short.places) >= 1
 
 
+def test_places_lie_in_the_polygon_that_can_be_walked(tmp_path):
+    triangle = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [0, 30], [0, 0]]]}
+    (tmp_path / "yard.geojson").write_text(json.dumps(triangle))
+    found = plan_measurements(None, 9, [0, 0, 30, 30], walkable=tmp_path / "yard.geojson")
+    assert len(found.places) == 9 and (found.places[:, :2].sum(1) <= 30).all()
+
+
 def test_it_stops_where_a_place_gains_too_little(predictor):
     found = plan_measurements(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
     assert 0 < len(found.places) < 50 and "less than 0.1 dB" in found.stopped

@@ -31,6 +31,7 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     values = np.zeros(grid.shape)
     values[0, 0] = np.nan  # south-west
     dot = power_view.station("west").dot
+    assert power_view.station("west").power is not None
     made = plane_sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)  # so that dots are seen whole
     assert made.image[-1, 0, 3] == 0 and (made.image[:-1, :, 3] > 0).all()
     left, _, _, high = grid.extent
