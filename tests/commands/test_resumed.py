@@ -176,6 +176,11 @@ def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra
     assert predicted.shape == (20, 16, 32) and np.abs(predicted.numpy() - expected).max() < 1e-5
 
 
+def test_a_method_without_a_field_has_no_module(others):
+    with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
+        load_module(others["nearest"])
+
+
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     """The settings it did not name were the defaults, and each of them stood in the refusal."""
     stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"
