@@ -68,6 +68,12 @@ def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
         interpolate_tones(response(tones), tones, centred_grid(float(tones.mean()), 30e3, 2400))
 
 
+def test_one_tone_is_flat() -> None:
+    assert torch.equal(
+        interpolate_tones(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
+    )
+
+
 def test_grid_is_sionna_s_order() -> None:
     channel = torch.arange(12.0).reshape(2, 3, 2)
     down = resource_grid(channel, 14, "rx")

@@ -9,6 +9,7 @@ from gsparc.apps.maps.intervals import (
     calibrate,
     cross_validate,
     interval_coverage,
+    nearest_distances,
 )
 
 
@@ -45,6 +46,13 @@ def test_width_rises_with_distance_and_ends():
     assert np.isnan(found.expected_error(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
 
 
+def test_the_model_without_any_sense_of_distance_still_gets_wider():
+    known = evidence()
+    flat = Evidence(**{**vars(known), "spread_db": np.ones(len(known))})
+    half = calibrate(flat).half
+    assert (np.diff(half) >= -1e-12).all() and half[-1] > 1.3 * half[0]
+
+
 def test_each_station_holds_its_own_share():
     known, fresh = evidence(stations=3), evidence(seed=1, stations=3)
     inside, _ = interval_coverage(calibrate(known), fresh)
@@ -76,6 +84,12 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
     assert abs(inside[np.isfinite(width)].mean() - 0.9) < 0.03
     said = cross_validate(censored, 0.9)
     assert all(abs(part - 0.9) < 0.04 for part in (said.share, said.heard_share, said.silent_share))
+
+
+def test_distance_is_to_rows_of_the_same_station():
+    known, station = np.array([[0.0, 0, 0], [10, 0, 0]]), np.array([0, 1])
+    places = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
+    assert nearest_distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]
 
 
 def test_too_little_evidence_promises_nothing():

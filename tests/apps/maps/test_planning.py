@@ -12,7 +12,7 @@ from gsparc.apps.maps.covariance import ErrorCovariance
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
-from gsparc.apps.maps.streets import Streets, Ways
+from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 
 
@@ -83,6 +83,15 @@ def test_a_long_walk_for_nothing_was_not_called_so(predictor):
     found = plan_measurements(predictor, 1, route=True)
     assert "hardly worth it: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
     assert not plan_measurements(None, 9, [0, 0, 30, 30]).in_vain
+
+
+def test_a_walk_is_not_longer_than_it_must_be():
+    rng = np.random.default_rng(0)
+    at = rng.permutation(12)[:, None]
+    tour = Tour(np.abs(at - at.T) * 1.0, int(np.argmin(at)), None)
+    for place in rng.permutation(np.flatnonzero(at)):
+        tour.add(place)
+    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.stops) == sorted(np.flatnonzero(at))
 
 
 def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
