@@ -21,6 +21,7 @@ REFUSED = [
     ("study model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
     ("report", "no run is named; say gsparc report RUN..., folders of runs"),
     ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
+    ("serve ckpt=none.ckpt host=example.org", "others reach it"),
     # Without baselines it was an AttributeError, after every combination had been made.
     ("tradeoff ckpt={spectra} baselines=[] eval_on=tset", "eval_on='tset' is none of train, val, test"),
     (f"{COMPARE} only=[own/random/meen/*]", "matches no cell"),

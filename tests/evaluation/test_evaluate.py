@@ -127,6 +127,15 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
     assert fit_baseline(name, data, split, "val").methods[0].size() == 27
 
 
+def test_wrong_counts_are_refused(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 40), folds(40, 2)
+    methods, seconds = fit_all(Mean, data, split)
+    with pytest.raises(ValueError, match="1 methods for the 2 folds"):
+        evaluate(methods[0], seconds[:1], data, split, clock=QUICK)
+    with pytest.raises(ValueError, match="1 training times for 2 methods"):
+        evaluate(methods, seconds[0], data, split, clock=QUICK)
+
+
 def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
     (method,), _ = fit_all(Mean, data, split)

@@ -70,6 +70,17 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
+def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
+    there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
+    drawn = {"kind": "rssi", "drawn": True}
+    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
+    figures = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    pictures.draw_splits(found, tmp_path / "city.png")
+    texts = [[text.get_text() for text in axis.texts] for axis in figures[0].axes]
+    assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
+
+
 def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
