@@ -95,6 +95,12 @@ def test_wrong_questions_get_clear_answers(spectra, folds, tmp_path):
         loaded(spectra[0], folds(40).folds[0], tmp_path, Mean.name).confidence(tx=HERE)
 
 
+def test_names_are_looked_up_on_first_use():
+    assert "load" in dir(gsparc)
+    with pytest.raises(AttributeError, match="lod"):
+        gsparc.lod  # noqa: B018
+
+
 def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):
     """One tone was repeated at whatever frequency was asked for, with a phase that belongs to another."""
     data = campaign("csi", 30, "tx")
