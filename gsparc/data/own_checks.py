@@ -32,7 +32,7 @@ class Checker:
     def __init__(self, raw: Raw, source: str) -> None:
         self.raw, self.source = raw, source
         self.problems = Problems(source)
-        self.notes: list[str] = []
+        self.notes = [*raw.notes]
         self.row_names: list[str] = []
         self.unknown: str | None = None  # a position that nobody gave
         self.sizes: dict[str, int] = {}  # of axes by their letter

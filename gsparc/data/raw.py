@@ -16,12 +16,12 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from shutil import disk_usage
 from tokenize import TokenError
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -53,17 +53,12 @@ class Raw:
         arrays: by name.
         attributes: numbers and strings about the whole file.
         units: unit of an array where the file gives one.
+        notes: how it was understood and what of it was left out, for the user, one line each.
     """
 
     arrays: dict[str, np.ndarray]
     attributes: dict[str, Any] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
-
-
-class Noted(NamedTuple):
-    """What a file holds, or a part of it, and remarks for the user, one line each."""
-
-    raw: Raw
     notes: tuple[str, ...] = ()
 
 
@@ -346,7 +341,7 @@ def numbered_rows(count: int) -> np.ndarray:
 
 def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
     """Return the same content with arrays renamed from the keys to the values of `names`."""
-    return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
+    return replace(raw, arrays={names.get(k, k): v for k, v in raw.arrays.items()})
 
 
 HEAP = b"GCOL"  # signature of a global heap (HDF5 file format specification 3.0, III.E)

@@ -65,10 +65,8 @@ class Campaign(DataModule):
 
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
-        raw = self.raw()
-        reading = interpret(raw, self.file, self.selection)
-        left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *reading.notes):
+        reading = interpret(self.raw(), self.file, self.selection)
+        for note in reading.notes:
             log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)

@@ -44,7 +44,7 @@ def test_techtile_release(tmp_path, kind):
     assert held["row_name"][0] == "EXP005 cycle 1" and held["row_name"][-1] == "EXP006 cycle 7"
     assert held["run"].tolist() == ["EXP005"] * CYCLES + ["EXP006"] * (CYCLES - 2)
     assert held["mask"].sum() == 3 * rows - 1 and not held["mask"][3, 2]
-    assert raw.attributes["left_out"] == "1 of 15 cycles left out: no position"
+    assert raw.notes[0] == "1 of 15 cycles left out: no position"
     # The release stores reference minus received phase, which rises with distance.
     expected = channels_of(held["tx_position"])
     assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
@@ -136,7 +136,7 @@ def test_values_that_were_never_written_are_none(tmp_path):
     variables = release_variables()
     variables["rover_x"][1][0, 2] = 9.969209968386869e36
     raw = read_techtile(write_release(tmp_path, variables=variables))
-    assert raw.attributes["left_out"].startswith("2 of 15 cycles")
+    assert raw.notes[0].startswith("2 of 15 cycles")
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
@@ -151,7 +151,7 @@ def test_powder_csv_holds_the_same(tmp_path):
     assert all(equal(table.arrays[name], npz.arrays[name]) for name in npz.arrays)
     assert np.isnan(table.arrays["rssi_db"]).sum() == 2  # -101 in the release
     assert table.arrays["row_name"][0] == "line 2"
-    assert "3 columns left out, no fixed place: bus-6186_rss" in table.attributes["left_out"]
+    assert "3 columns left out, no fixed place: bus-6186_rss" in table.notes[0]
 
 
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
@@ -159,7 +159,7 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
     )
     assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays["rssi_db"].shape == (20, 1)
-    assert "madsen-nuc2-b210" in raw.attributes["left_out"]
+    assert "madsen-nuc2-b210" in raw.notes[0]
 
 
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
