@@ -15,7 +15,7 @@ import numpy as np
 
 from gsparc.data.assemble import centre_positions, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
-from gsparc.data.errors import DataError, Problems, explain_error
+from gsparc.data.errors import DataError, Problems, readable
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
 from gsparc.data.own_checks import Checker
@@ -121,12 +121,8 @@ def _channels(root: Path) -> np.ndarray:
 
 
 def _loaded(path: Path, expected: str) -> np.ndarray:
-    try:
+    with readable(path, "not readable", (ValueError, OSError), f"missing; {expected}"):
         return np.asarray(np.load(path, allow_pickle=False))
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing; {expected}") from None
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable ({explain_error(error)})") from None
 
 
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:

@@ -21,7 +21,7 @@ from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, read
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
@@ -64,7 +64,7 @@ def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
     """
     path = Path(path)
     if path.suffix.lower() in NETCDF_SUFFIXES:
-        return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
+        return _of_release(_with_experiments(read_raw(path), path), path, antennas)
     return read_converted(path, NPZ, name="techtile", layout="techtile")
 
 

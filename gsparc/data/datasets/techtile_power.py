@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, readable
 from gsparc.data.pickles import read_pickle
 from gsparc.data.raw import Raw, read_raw
 
@@ -61,10 +61,9 @@ def _of_release(folder: Path) -> Raw:
 def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.ndarray:
     """Attributes (rows, names) of the objects in an array; DataError where one has none of them."""
     held: Any = read_pickle(path, classes, npy=True)
-    try:
+    errors = (AttributeError, KeyError, TypeError, ValueError)
+    with readable(path, f"expected an array of objects with {', '.join(names)}", errors):
         return np.array([[float(one.state[name]) for name in names] for one in held])
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise DataError(f"{path}: expected an array of objects with {', '.join(names)}") from None
 
 
 class TechtilePower(Campaign):

@@ -28,7 +28,7 @@ from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, load
-from gsparc.data.raw import read_netcdf
+from gsparc.data.raw import read_raw
 
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
@@ -128,8 +128,8 @@ def test_damaged_netcdf(tmp_path, refused, kind):
     whole = path.read_bytes()
     for content in (b"", b"hello", whole[: len(whole) // 2], whole[:40], b"CDF\x05" + whole[4:]):
         path.write_bytes(content)
-        refused("csi.nc: ", read_netcdf, path)
-    refused("no such file", read_netcdf, tmp_path / "other.nc")
+        refused("csi.nc: ", read_raw, path)
+    refused("no such file", read_raw, tmp_path / "other.nc")
 
 
 def test_values_that_were_never_written_are_none(tmp_path):
