@@ -335,8 +335,9 @@ def numbered_rows(count: int) -> np.ndarray:
 
 
 def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
-    """Return the same content with arrays renamed from the keys to the values of `names`."""
-    return replace(raw, arrays={names.get(k, k): v for k, v in raw.arrays.items()})
+    """Return the same content with arrays and their units renamed from the keys to the values of `names`."""
+    arrays = {names.get(k, k): v for k, v in raw.arrays.items()}
+    return replace(raw, arrays=arrays, units={names.get(k, k): v for k, v in raw.units.items()})
 
 
 HEAP = b"GCOL"  # signature of a global heap (HDF5 file format specification 3.0, III.E)

@@ -20,7 +20,7 @@ from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
 from gsparc.data.errors import DataError
 from gsparc.data.files import SeveralFiles
-from gsparc.data.limits import choice, finite_array, or_null, switch
+from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.tables import is_table
@@ -76,14 +76,10 @@ def apply_settings(
         **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
-        SettingError: another word for `absent`, or for a convention.
+        SettingError: another word for a convention.
     """
-    choice("auto", "unknown", "silent").check("dataset.absent", absent)
-    said: dict[str, Any] = (
-        {} if not_heard is None else {"not_heard": finite_array(not_heard).reshape(-1).tolist()}
-    )
-    said |= {} if absent == "auto" else {"absent": absent}
-    said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
+    settings = {"not_heard": not_heard, "absent": absent, "saturation_db": saturation_db}
+    said: dict[str, Any] = {name: value for name, value in settings.items() if value not in (None, "auto")}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]

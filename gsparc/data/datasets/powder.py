@@ -79,7 +79,7 @@ def _of_npz(path: Path) -> Raw:
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
     latitude, longitude = ((stations - middle) @ turn + mean).T
-    return Raw({**raw.arrays, "station_latitude": latitude, "station_longitude": longitude}, raw.attributes)
+    return replace(raw, arrays={**raw.arrays, "station_latitude": latitude, "station_longitude": longitude})
 
 
 def _of_csv(path: Path, table: Path) -> Raw:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.links.absent import add_absent, add_unlisted
-from gsparc.data.links.hearing import POWERS, censor_rows
+from gsparc.data.links.hearing import POWERS, censor_rows, check_said
 from gsparc.data.links.positions import positions_in_metres
 from gsparc.data.links.stations import (
     SECTOR,
@@ -41,6 +41,7 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
         measured: name of the measurement.
         part: of the campaign.
     """
+    check_said(check.raw.attributes)
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
     if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
         rows = len(check.raw.arrays[measured])

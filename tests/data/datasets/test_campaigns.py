@@ -28,7 +28,7 @@ from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, load
-from gsparc.data.raw import read_raw
+from gsparc.data.raw import Raw, read_raw, write_raw
 
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
@@ -285,3 +285,12 @@ def test_measured_stations_lie_where_the_release_says():
     assert np.allclose(where, [40.7677, -111.83816], atol=1e-7)  # the release's own table, to its five digits
     data = load({"name": "powder", "file": str(path), "stations": ["ebc-nuc1-b210"]})
     assert len(data) == np.isfinite(held["rssi_db"][:, station]).sum()
+
+
+def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):
+    """Under their names in the file, which are not the schema's."""
+    with np.load(real("real/ble-hall-2.npz")) as stored:
+        write_raw(tmp_path / "hall.npz", Raw(dict(stored), {}, {"mobile_position": "mm"}))
+    refused(
+        "tx_position: units are 'mm'; expected 'm'", lambda path: read_any(path).data, tmp_path / "hall.npz"
+    )

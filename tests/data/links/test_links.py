@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.checks.describe import describe, suspicious_values
+from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.selection import Selection
@@ -264,3 +265,15 @@ def test_one_station_in_degrees_needed_a_column():
     }
     found = interpret(Raw({**degrees, **mast, "rssi_db": LEVELS[:, 0]}, {}), "own")
     assert len(found.data) == PLACES and len(found.data.site.stations) == 1
+
+
+@pytest.mark.parametrize("said", [{"not_heard": "none"}, {"not_heard": [-999, "x"]}, {"absent": "silnt"}])
+def test_what_is_said_of_unheard_powers_was_not_checked(said):
+    """An attribute of text was a traceback; a mark that is no level, or a mistyped word, counted as none."""
+    with pytest.raises(SettingError, match=f"dataset.{next(iter(said))}="):
+        interpret(Raw(town(), said), "town.npz")
+    levels = np.where(np.arange(PLACES) < 4, -np.inf, LEVELS[:, 0])
+    marked = Raw(
+        town(rssi_db=levels, station_position=POSTS[:1], station_name=None), {"not_heard": [-np.inf]}
+    )
+    assert (interpret(marked, "town.npz").data.censored == 1).sum() == 4
