@@ -143,8 +143,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     named = str(raw.attributes.get("conventions", "")).split()
     # Transposed images: their grid is that of the axes as they will be.
-    height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
-    grid = check.grid(height, width) if kind == "spectrum" else None
+    turned = values.shape[:0:-1] if "transposed" in named else values.shape[1:]
+    grid = check.grid(*turned) if kind == "spectrum" else None
     antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
     array = check.real("array_position", (antennas, 3))
     if array is not None and len(bad_positions(array)):
@@ -196,7 +196,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
-    noise = None if noise is None else (noise / scale**2).astype(np.float32)
+    noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)  # `**` may overflow
     site = replace(data.site, target_scale=scale)
     data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
     return Reading(data, tuple(check.notes))

@@ -54,12 +54,12 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
         return None
     arrays.pop("sensitivity_db", None)
     mask = arrays.get("mask")
-    if mask is not None and (mask.shape != values.shape or mask.dtype.kind not in "biu"):
+    if mask is not None and mask.shape != values.shape:
         return links  # said where the mask is read
     # A spectrum without power has no directions; where rows have paths they are a simulation's.
     silent = measured == "spectrum" and not is_big(values) and "path_offsets" not in arrays
     gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
-    if values.dtype.kind not in "iufc" or values.ndim == 0 or not (gaps or mask is not None or silent):
+    if not (gaps or mask is not None or silent):
         return links
     axes = tuple(range(1, values.ndim))
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
@@ -136,7 +136,8 @@ def _note_floor(
         named = of_row.named([*map(str, check.raw.arrays["row_name"])])[row]
         wrong = f"{named}: rssi_db is {values[row]:.4g}, below {floor[row]:.4g}"
         return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
-    highest, weakest = floor[censored].max(initial=-np.inf), values[known].min(initial=np.inf)
+    # Levels may be whole numbers, among which there is no infinity.
+    highest, weakest = floor[censored].max(initial=-np.inf), values[known].astype(float).min(initial=np.inf)
     if FAR_BELOW_DB < weakest - highest < np.inf:
         check.notes.append(
             f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
