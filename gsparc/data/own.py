@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import bad_positions, centre_positions, rounded_rms
+from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.checks.outliers import check_static_ends, peak_magnitudes, too_strong
 from gsparc.data.conventions import convert_conventions
@@ -147,8 +147,9 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     grid = check.grid(*turned) if kind == "spectrum" else None
     antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
     array = check.real("array_position", (antennas, 3))
-    if array is not None and len(bad_positions(array)):
-        check.refuse("array_position", "not finite, or not on Earth; expected coordinates in metres")
+    if array is not None:
+        antenna = [f"antenna {i}" for i in range(len(array))]
+        check_positions(check.problems, check.where("array_position"), array, antenna)
     noise = _not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":

@@ -286,9 +286,9 @@ class Checker:
             return None
         parts = []
         for name in names:
-            index = self.array(name, (None,))
-            if index is None or index.size == 0:
-                return None if index is None else self.refuse(name, "expected a row number or more")
+            index = self.raw.arrays[name]
+            if index.size == 0:
+                return self.refuse(name, "expected a row number or more")
             out = index[(index < 0) | (index >= rows)]
             values, counts = np.unique(index, return_counts=True)
             self._refuse_numbers(name, out, f"out of range; rows are 0 to {rows - 1}")
