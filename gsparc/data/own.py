@@ -22,7 +22,7 @@ from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements, Site
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Kind, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.units import LINEAR, PowerUnit
 
@@ -158,8 +158,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     offsets = check.ragged(rows)
     release_split = check.release_split(rows)
     _in_range(check, measured, values, mask)
-    _static(check, links, ends["rx"], ends["tx"], rotation)
-    _within_reach(check, links, ends)
+    if all(one is not None for one in (*ends.values(), rotation)):
+        _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None
     static_end = links.static_end
@@ -299,24 +299,19 @@ def _infinite(values: np.ndarray) -> np.ndarray:
     return ~np.isfinite(np.abs(values))
 
 
-def _static(
-    check: Checker, links: Links, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
-) -> None:
-    """Note ends of which neither moves, and a receiver that stands still but turns."""
-    if rx is None or tx is None or rotation is None:
-        return
-    if links.stations is None and all((p == np.atleast_2d(p)[:1]).all() for p in (rx, tx)):
-        check.problems.add(check.source, "neither end moves; expected (S, 3) positions for one of them")
-    elif links.static_end == "rx" and links.stations is None and (rotation != rotation[0]).any():
+def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:
+    """Refuse ends of which neither moves, a static receiver that turns, and static ends far from all rows."""
+    several, fault = links.stations is not None, ""
+    if not several and all((p == np.atleast_2d(p)[:1]).all() for p in ends.values()):
+        fault = "neither end moves; expected (S, 3) positions for one of them"
+    elif not several and links.static_end == "rx" and (rotation != rotation[0]).any():
         fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
+    if fault:
         check.problems.add(check.source, fault)
-
-
-def _within_reach(check: Checker, links: Links, ends: Mapping[str, np.ndarray | None]) -> None:
-    """Refuse static ends that cannot be of these rows, and note those that hardly are."""
-    still = None if links.static_end is None else ends[links.static_end]
-    moving = ends["tx" if links.static_end == "rx" else "rx"]
-    if still is None or moving is None or moving.ndim < 2 or not np.isfinite(still).any():
+    if links.static_end is None:
+        return
+    still, moving = ends[links.static_end], ends[OTHER[links.static_end]]
+    if moving.ndim < 2 or not np.isfinite(still).any():
         return
     fault, certain = check_static_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
     if fault and certain:
