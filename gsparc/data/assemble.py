@@ -17,16 +17,11 @@ from gsparc.data.schema import Measurements
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
 
-def bad_positions(position: np.ndarray) -> np.ndarray:
-    """Return rows (n,) of `position` (S, 3) [m] that no place on Earth could have."""
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
-    return np.flatnonzero(~good)
-
-
 def check_positions(problems: Problems, where: str, position: np.ndarray, row_names: list[str]) -> bool:
     """Note rows whose position (S, 3) [m] is not finite or not on Earth; returns whether there are any."""
-    bad = bad_positions(position)
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
+    bad = np.flatnonzero(~good)
     problems.add_rows(
         where,
         (f"{row_names[i]} = {np.array2string(position[i], separator=', ')}" for i in bad),

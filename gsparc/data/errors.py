@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -90,6 +91,27 @@ class DataError(ValueError):
         more = len(self.problems) - 1
         hint = f" (and {more} more: gsparc check {source or 'FILE'} lists them)" if more > 0 else ""
         super().__init__(self.problems[0] + hint)
+
+
+@contextmanager
+def readable(
+    where: str | Path, fault: str, errors: type[Exception] | tuple[type[Exception], ...], missing: str = ""
+) -> Iterator[None]:
+    """Raise `DataError` in place of what other libraries raise in the block: WHERE: FAULT (what they say).
+
+    Args:
+        where: file, and part of it.
+        fault: in words.
+        errors: that are so turned; a `DataError` is left as it is.
+        missing: said of a file that is not there, alone; empty: nothing else than of other errors.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except errors as error:
+        lacking = missing and isinstance(error, FileNotFoundError)
+        raise DataError(f"{where}: {missing if lacking else f'{fault} ({explain_error(error)})'}") from None
 
 
 class Problems(list[str]):

@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.data.errors import DataError, explain_error
+from gsparc.data.errors import DataError, readable
 
 SUMMARY = "summary.json"  # of a finished run, written last
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
@@ -52,21 +52,15 @@ class SeveralFiles(str):
 
 def read_text(path: Path, missing: str, kind: str = "text") -> str:
     """Read a text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
-    try:
+    with readable(path, f"not readable as {kind}", (UnicodeDecodeError, OSError), missing):
         return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise DataError(f"{path}: {missing}") from None
-    except (UnicodeDecodeError, OSError) as error:
-        raise DataError(f"{path}: not readable as {kind} ({explain_error(error)})") from None
 
 
 def read_csv(path: Path, missing: str) -> list[list[str]]:
     """Read cells of each line, between commas; `DataError` as of `read_text`."""
     text = read_text(path, missing, "CSV text")
-    try:
+    with readable(path, "not readable as CSV text", csv.Error):
         return list(csv.reader(map(partial(check_line_length, path), count(1), io.StringIO(text))))
-    except csv.Error as error:
-        raise DataError(f"{path}: not readable as CSV text ({error})") from None
 
 
 def read_shipped_table(package: str, name: str) -> list[dict[str, str]]:
@@ -119,12 +113,8 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
     Raises:
         DataError: missing, not readable, or no table.
     """
-    try:
+    with readable(path, "not readable as YAML", (yaml.YAMLError, ValueError, RecursionError)):
         content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"), path)
-    except DataError:
-        raise
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as YAML ({explain_error(error)})") from None
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import bad_positions, centre_positions, rounded_rms
+from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.checks.outliers import check_static_ends, peak_magnitudes, too_strong
 from gsparc.data.conventions import convert_conventions
@@ -22,7 +22,7 @@ from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, Kind, Links, Measurements, Site
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Kind, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.units import LINEAR, PowerUnit
 
@@ -143,12 +143,13 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     named = str(raw.attributes.get("conventions", "")).split()
     # Transposed images: their grid is that of the axes as they will be.
-    height, width = values.shape[:0:-1] if "transposed" in named else values.shape[-2:]
-    grid = check.grid(height, width) if kind == "spectrum" else None
+    turned = values.shape[:0:-1] if "transposed" in named else values.shape[1:]
+    grid = check.grid(*turned) if kind == "spectrum" else None
     antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
     array = check.real("array_position", (antennas, 3))
-    if array is not None and len(bad_positions(array)):
-        check.refuse("array_position", "not finite, or not on Earth; expected coordinates in metres")
+    if array is not None:
+        antenna = [f"antenna {i}" for i in range(len(array))]
+        check_positions(check.problems, check.where("array_position"), array, antenna)
     noise = _not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
@@ -157,8 +158,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     offsets = check.ragged(rows)
     release_split = check.release_split(rows)
     _in_range(check, measured, values, mask)
-    _static(check, links, ends["rx"], ends["tx"], rotation)
-    _within_reach(check, links, ends)
+    if all(one is not None for one in (*ends.values(), rotation)):
+        _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None
     static_end = links.static_end
@@ -196,7 +197,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
-    noise = None if noise is None else (noise / scale**2).astype(np.float32)
+    noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)  # `**` may overflow
     site = replace(data.site, target_scale=scale)
     data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
     return Reading(data, tuple(check.notes))
@@ -298,24 +299,19 @@ def _infinite(values: np.ndarray) -> np.ndarray:
     return ~np.isfinite(np.abs(values))
 
 
-def _static(
-    check: Checker, links: Links, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
-) -> None:
-    """Note ends of which neither moves, and a receiver that stands still but turns."""
-    if rx is None or tx is None or rotation is None:
-        return
-    if links.stations is None and all((p == np.atleast_2d(p)[:1]).all() for p in (rx, tx)):
-        check.problems.add(check.source, "neither end moves; expected (S, 3) positions for one of them")
-    elif links.static_end == "rx" and links.stations is None and (rotation != rotation[0]).any():
+def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:
+    """Refuse ends of which neither moves, a static receiver that turns, and static ends far from all rows."""
+    several, fault = links.stations is not None, ""
+    if not several and all((p == np.atleast_2d(p)[:1]).all() for p in ends.values()):
+        fault = "neither end moves; expected (S, 3) positions for one of them"
+    elif not several and links.static_end == "rx" and (rotation != rotation[0]).any():
         fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
+    if fault:
         check.problems.add(check.source, fault)
-
-
-def _within_reach(check: Checker, links: Links, ends: Mapping[str, np.ndarray | None]) -> None:
-    """Refuse static ends that cannot be of these rows, and note those that hardly are."""
-    still = None if links.static_end is None else ends[links.static_end]
-    moving = ends["tx" if links.static_end == "rx" else "rx"]
-    if still is None or moving is None or moving.ndim < 2 or not np.isfinite(still).any():
+    if links.static_end is None:
+        return
+    still, moving = ends[links.static_end], ends[OTHER[links.static_end]]
+    if moving.ndim < 2 or not np.isfinite(still).any():
         return
     fault, certain = check_static_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
     if fault and certain:

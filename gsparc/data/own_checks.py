@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,11 @@ class Checker:
     """Takes arrays out of a `Raw`, noting what is wrong; a method returns None when its array is unusable."""
 
     def __init__(self, raw: Raw, source: str) -> None:
-        self.raw, self.source = raw, source
+        # HDF5 holds attributes that are arrays: lists can be compared with words.
+        plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.attributes.items()}
+        self.raw, self.source = replace(raw, attributes=plain), source
         self.problems = Problems(source)
-        self.notes: list[str] = []
+        self.notes = [*raw.notes]
         self.row_names: list[str] = []
         self.unknown: str | None = None  # a position that nobody gave
         self.sizes: dict[str, int] = {}  # of axes by their letter
@@ -56,12 +59,21 @@ class Checker:
         return [name for name in names if name in self.raw.arrays]
 
     def names(self) -> None:
-        """Refuse misspelt names and foreign units; note that other unknown names are ignored."""
+        """Refuse misspelt names and foreign units; note that other unknown names are ignored.
+
+        Raises:
+            DataError: arrays of another type or number of axes than the schema's: nobody else looks at these.
+        """
+        sound = True
         for name in self.raw.arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
                 if unit != FIELDS[name].unit:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
+                shapes = FIELDS[name].shapes
+                # Channels and spectra may have an axis of stations behind that of rows.
+                shapes += [(*shape, None) for shape in shapes] if name in ("csi", "spectrum") else []
+                sound &= self.array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
             if hint := suggest_nearest(
@@ -70,6 +82,8 @@ class Checker:
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")
+        if not sound:
+            self.problems.raise_if_any()
 
     def measurement(self) -> str | None:
         """Choose spectrum, csi, rssi or rssi_db: the only one, or the one that an attribute names."""
@@ -112,12 +126,12 @@ class Checker:
     def fits(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
         """Tell whether `array` has one of `shapes`, letters for sizes found before; note it when not."""
         wanted = [tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes]
-        if any(_fits(array.shape, shape) for shape in wanted):
+        if not wanted or any(_fits(array.shape, shape) for shape in wanted):
             return True
         # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
         turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
-        here = " or ".join(str(shape).replace("None", "any") for shape in wanted)
-        here = f", here {here}" if any(size is not None for shape in wanted for size in shape) else ""
+        here = " or ".join(map(str, wanted))
+        here = f", here {here}" if any(wanted) and "None" not in here else ""
         known = FIELDS[name].shape if name in FIELDS else str(shapes[0]).replace("'", "")
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
         self.refuse(name, f"expected shape {known}{here}, {fault}")
@@ -141,7 +155,7 @@ class Checker:
             return None
         stored = self.raw.arrays[name]
         # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
-        step = float(np.spacing(np.abs(stored).max())) if stored.dtype.kind == "f" else 0.0
+        step = float(np.spacing(np.abs(stored).max(initial=0))) if stored.dtype.kind == "f" else 0.0
         if stored.dtype.itemsize <= 4 and step > 1e-3:
             self.notes.append(
                 f"{name}: stored as {stored.dtype} this far from the origin, it moves in steps of "
@@ -272,9 +286,9 @@ class Checker:
             return None
         parts = []
         for name in names:
-            index = self.array(name, (None,))
-            if index is None or index.size == 0:
-                return None if index is None else self.refuse(name, "expected a row number or more")
+            index = self.raw.arrays[name]
+            if index.size == 0:
+                return self.refuse(name, "expected a row number or more")
             out = index[(index < 0) | (index >= rows)]
             values, counts = np.unique(index, return_counts=True)
             self._refuse_numbers(name, out, f"out of range; rows are 0 to {rows - 1}")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy._core import multiarray
 from numpy.lib.format import MAGIC_LEN
 
-from gsparc.data.errors import DataError, explain_error
+from gsparc.data.errors import readable
 
 
 class Placeholder:
@@ -78,7 +78,8 @@ class _Unpickler(pickle.Unpickler):
             return ARRAYS[f"{plain}.{name}"]
         if f"{module}.{name}" in self.stand_ins:
             return Placeholder
-        raise DataError(f"asks for {module}.{name}, which is neither an array nor a part of a table: not run")
+        fault = f"asks for {module}.{name}, which is neither an array nor a part of a table: not run"
+        raise pickle.UnpicklingError(fault)
 
 
 def read_pickle(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
@@ -92,18 +93,15 @@ def read_pickle(path: Path, stand_ins: set[str], npy: bool = False) -> Any:
     Raises:
         DataError: missing, damaged, or it names something else.
     """
-    try:
-        with path.open("rb") as file:
-            if npy:
-                version = file.read(MAGIC_LEN)[-2]
-                file.read(int.from_bytes(file.read(2 if version == 1 else 4), "little"))
-            return _Unpickler(file, stand_ins).load()
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
-    except Exception as error:  # whatever a damaged pickle makes the parts raise
-        raise DataError(f"{path}: damaged, or no pickle of arrays ({explain_error(error)})") from None
+    # A damaged pickle makes its parts raise anything.
+    with (
+        readable(path, "damaged, or no pickle of arrays", Exception, "no such file"),
+        path.open("rb") as file,
+    ):
+        if npy:
+            version = file.read(MAGIC_LEN)[-2]
+            file.read(int.from_bytes(file.read(2 if version == 1 else 4), "little"))
+        return _Unpickler(file, stand_ins).load()
 
 
 def read_pickled_frame(path: Path) -> dict[str, np.ndarray]:
@@ -113,12 +111,11 @@ def read_pickled_frame(path: Path) -> dict[str, np.ndarray]:
         DataError: as `read_pickle`, or it is no table.
     """
     frame = read_pickle(path, FRAMES)
-    try:
+    errors = (AttributeError, KeyError, TypeError, ValueError, IndexError)
+    with readable(path, "no pickled pandas table", errors):
         blocks, (heads, _) = frame.state["_mgr"].made_with[:2]
         names = heads.made_with[1]["data"]
         columns: dict[str, np.ndarray] = {}
         for values, place, *_ in (block.made_with for block in blocks):
             columns |= dict(zip(names[place], np.asarray(values), strict=True))
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError):
-        raise DataError(f"{path}: no pickled pandas table") from None
     return columns

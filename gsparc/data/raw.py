@@ -16,12 +16,12 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from shutil import disk_usage
 from tokenize import TokenError
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -31,10 +31,11 @@ from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
-from gsparc.data.errors import DataError, explain_error
+from gsparc.data.errors import DataError, explain_error, readable
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
 UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
@@ -53,22 +54,17 @@ class Raw:
         arrays: by name.
         attributes: numbers and strings about the whole file.
         units: unit of an array where the file gives one.
+        notes: how it was understood and what of it was left out, for the user, one line each.
     """
 
     arrays: dict[str, np.ndarray]
     attributes: dict[str, Any] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
-
-
-class Noted(NamedTuple):
-    """What a file holds, or a part of it, and remarks for the user, one line each."""
-
-    raw: Raw
     notes: tuple[str, ...] = ()
 
 
 def read_raw(path: str | Path) -> Raw:
-    """Read every array of an npz, HDF5 or MATLAB file.
+    """Read every array of an npz, HDF5, MATLAB or NetCDF file.
 
     Raises:
         DataError: no such file, another format, damaged, or Python objects inside.
@@ -76,7 +72,8 @@ def read_raw(path: str | Path) -> Raw:
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
-    readers = {".npz": _read_npz, ".mat": _read_mat, **dict.fromkeys(HDF5_SUFFIXES, _read_hdf5)}
+    readers = {".npz": _read_npz, ".mat": _read_mat}
+    readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
     if path.suffix.lower() not in readers:
         suffix = path.suffix or "no ending"
         raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
@@ -189,11 +186,9 @@ def verified_archive(path: Path) -> BytesIO:
 def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
-    try:
+    with readable(path, "cannot be read", OSError):
         if not is_archive(path):  # numpy would take anything else for a pickle and speak of that
             raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({explain_error(error)})") from None
     refuse_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -210,15 +205,12 @@ def _read_npz(path: Path) -> Raw:
     text = arrays.pop("attributes", None)
     if text is None:
         return Raw(arrays)
-    try:
+    errors = (ValueError, TypeError, RecursionError)
+    with readable(f"{path}, attributes", "expected a JSON table as text", errors):
         attributes = json.loads(str(text))
         units = attributes.pop("units", {}) if isinstance(attributes, dict) else None
         if not isinstance(units, dict):
             raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is no table")
-    except (ValueError, TypeError, RecursionError) as error:
-        raise DataError(
-            f"{path}, attributes: expected a JSON table as text ({explain_error(error)})"
-        ) from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
@@ -281,10 +273,8 @@ def _read_mat(path: Path) -> Raw:
     if h5py.is_hdf5(path):  # version 7.3 writes HDF5, the axes of arrays in reverse
         arrays = {name: array.T for name, array in _read_hdf5(path).arrays.items()}
     else:
-        try:
+        with readable(path, "damaged or not a MATLAB file", (*DAMAGED, IndexError)):
             content = loadmat(path)
-        except (*DAMAGED, IndexError) as error:
-            raise DataError(f"{path}: damaged or not a MATLAB file ({explain_error(error)})") from None
         arrays = {name: array for name, array in content.items() if not name.startswith("__")}
     words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
     for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
@@ -345,8 +335,9 @@ def numbered_rows(count: int) -> np.ndarray:
 
 
 def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
-    """Return the same content with arrays renamed from the keys to the values of `names`."""
-    return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
+    """Return the same content with arrays and their units renamed from the keys to the values of `names`."""
+    arrays = {names.get(k, k): v for k, v in raw.arrays.items()}
+    return replace(raw, arrays=arrays, units={names.get(k, k): v for k, v in raw.units.items()})
 
 
 HEAP = b"GCOL"  # signature of a global heap (HDF5 file format specification 3.0, III.E)
@@ -385,19 +376,11 @@ def _has_heap(path: Path) -> bool:
         return content.find(HEAP) >= 0
 
 
-NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
 NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is 9.97e36
 
 
-def read_netcdf(path: str | Path) -> Raw:
-    """Read every variable of the root group; text as text, fill values of floating point numbers as NaN.
-
-    Raises:
-        DataError: no such file, another format, or damaged.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected a NetCDF file")
+def _read_netcdf(path: Path) -> Raw:
+    """Every variable of the root group; text as text, fill values of floating point numbers as NaN."""
     with path.open("rb") as file:
         start = file.read(4)
     if start == b"CDF\x05":
@@ -405,14 +388,11 @@ def read_netcdf(path: str | Path) -> Raw:
     read = _classic if start[:3] == b"CDF" else _hdf5 if start == b"\x89HDF" else None
     if read is None:
         raise DataError(f"{path}: neither NetCDF3 nor NetCDF4; its first bytes are {start!r}")
-    try:
-        arrays = {name: _of_netcdf(*variable) for name, variable in read(path).items()}
-    except DataError:
-        raise
-    except (*DAMAGED, AssertionError, IndexError, AttributeError) as error:  # what SciPy raises on damage
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{path}: damaged or not a NetCDF file ({why})") from None
-    return Raw(arrays)
+    # The last three are what SciPy raises on damage.
+    with readable(
+        path, "damaged or not a NetCDF file", (*DAMAGED, AssertionError, IndexError, AttributeError)
+    ):
+        return Raw({name: _of_netcdf(*variable) for name, variable in read(path).items()})
 
 
 def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:

@@ -378,18 +378,33 @@ class Field:
     required: str
     meaning: str
 
+    @property
+    def shapes(self) -> list[tuple[int | None, ...]]:
+        """Allowed shapes, None for any size; empty where they follow from another array.
+
+        >>> FIELDS["rx_orientation"].shapes
+        [(4,), (None, 4)]
+        """
+        parts = [part.split(",") for part in re.findall(r"\(([^)]*)\)", self.shape)]
+        return [tuple(int(a) if a.strip().isdigit() else None for a in part if a.strip()) for part in parts]
+
 
 FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data", "fields.csv")}
 
 # Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
 REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"
+NAMES, GAINS = "USiufb", "ciuf"
 KIND_WORDS = {
     **{REAL: "real numbers", WHOLE: "whole numbers", COMPLEX: "complex numbers", FLAGS: "True and False"},
     **{TEXT: "text", LABELS: "text or whole numbers", POWER: "uint8 or floating point numbers"},
+    **{NAMES: "text or numbers", GAINS: "numbers"},
 }
 KINDS = {
     **{"spectrum": POWER, "csi": COMPLEX, "mask": FLAGS, "run": LABELS, "station": WHOLE},
     **dict.fromkeys(("path_offsets", "split_train", "split_test"), WHOLE),
+    **dict.fromkeys(("station_name", "station_label", "row_name"), NAMES),
+    **dict.fromkeys(("path_gain", "source_gain"), GAINS),
+    **dict.fromkeys(("line_of_sight", "source_visible"), FLAGS),
 }
 MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")

@@ -204,14 +204,14 @@ def take_rows(arrays: Arrays, rows: np.ndarray, count: int) -> Arrays:
     for name, array in arrays.items():
         if (name in ALWAYS or array.ndim in ROW_AXES.get(name, ())) and array.shape[:1] == (count,):
             part[name] = take(array, rows)
-        elif name in SPLIT and array.ndim == 1 and array.dtype.kind in "iu":
+        elif name in SPLIT:
             # Rows may repeat or be gone: a row of the split then stands in several places, or in none.
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]
             part[name] = np.concatenate([np.sort(order[_runs(first, last - first)]), outside])
     offsets = arrays.get("path_offsets")
-    if offsets is not None and offsets.shape == (count + 1,) and offsets.dtype.kind in "iu":
+    if offsets is not None and offsets.shape == (count + 1,):
         offsets = offsets.astype(np.int64)
         # Offsets that decrease are refused by whoever reads paths; until then such rows have none.
         lengths = np.diff(offsets).clip(0)[rows]

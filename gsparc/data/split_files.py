@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError, explain_error
+from gsparc.data.errors import DataError, readable
 from gsparc.data.files import whole_file
 from gsparc.data.splits import Fold, Split, hash_indices
 
@@ -34,20 +34,15 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
         DataError: not an index file, made for another number of rows, edited, or with overlapping parts.
     """
     path = Path(path)
-    try:
+    # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
+    errors = (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError)
+    with readable(path, "not a split file", errors, "no such split file; a run writes one as split.json"):
         content = json.loads(path.read_text(encoding="utf-8"))
         folds = tuple(
             Fold(*(np.array(f[k], dtype=np.int64).reshape(-1) for k in ("train", "val", "test")))
             for f in content["folds"]
         )
         name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
-    # Whatever a damaged or foreign JSON file raises: deep brackets, huge numbers, other types.
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise DataError(
-            f"{path}: not a split file ({type(error).__name__}: {explain_error(error)})"
-        ) from None
     if stored_rows != rows:
         raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
     for i, fold in enumerate(folds):

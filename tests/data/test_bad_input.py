@@ -82,7 +82,7 @@ CSI = {
     "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
     "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),
     "one frequency for three": (_set("frequency_hz", np.array(2.4e9)), "one frequency, but csi has 3 columns"),
-    "antenna nan": (_entry("array_position", (0, 0), np.nan), "array_position: not finite"),
+    "antenna nan": (_entry("array_position", (0, 0), np.nan), "antenna 0 = .*three finite coordinates"),
     "two orientations": (_set("rx_rotation", np.eye(3)), "both given; expected one"),
     "a mirror": (_together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
                  "determinant [+]1"),

@@ -79,7 +79,7 @@ CASES = {
     "degrees in metres": (table("LAT,LON,rssi", *(PLACES + np.array([5e6, 4e5])).T, LEVELS[:, 0]), {},
         "dataset.columns.x=LON dataset.columns.y=LAT", ""),
     "two zones": (long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES), {},
-        "two groups of places 399.9 km apart, as column 'grid' says", "millimetres"),
+        "two groups of places 399.9 km apart", "millimetres"),
     "floors": (long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR), {}, "dataset.columns.z=Storey*3.2",
         ""),
     "floors as metres": (long("floor", FLOOR), {"columns": {"z": "floor"}}, "floors as heights in metres?",

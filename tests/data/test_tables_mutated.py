@@ -259,7 +259,7 @@ def load(drive: Drive, folder) -> Measurements:
     if drive.listed is not None:
         stations = folder / "stations.csv"
         stations.write_text("\n".join(Drive(drive.listed, ";", ",", 9).lines()))
-    return interpret(understand_table(folder / "a.csv", drive.said, stations).raw, "a.csv").data
+    return interpret(understand_table(folder / "a.csv", drive.said, stations), "a.csv").data
 
 
 def rows_of(data: Measurements) -> list[tuple]:

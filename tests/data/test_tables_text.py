@@ -18,11 +18,11 @@ def test_stations_of_unknown_place_could_not_be_read(write, refused):
     text = "x,y,rssi,cell\n1,2,-80,b\n2,3,-81,a\n4,4,-82,b\n9,4,-83,a\n"
     table = understand_table(write(text))
     assert any("no places of the stations: unknown" in note for note in table.notes)
-    data = interpret(table.raw, "drive").data
+    data = interpret(table, "drive").data
     assert data.site.stations.name == ("b", "a") and np.isnan(data.site.stations.position).all()
     assert data.station.tolist() == [0, 1, 0, 1] and np.isfinite(data.site.box).all()
     for one, axes in ((text, "x,y"), (text.replace("x,y", "lat,lon"), "lat,lon")):
-        some = understand_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv")).raw
+        some = understand_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
         known = np.isfinite(interpret(some, "drive").data.site.stations.position).all(axis=1)
         assert known.tolist() == [True, False]
     listed = write("name,x,y\na,3,4\nb,1,\n", "stations.csv")
@@ -37,20 +37,20 @@ def test_rows_that_begin_like_comments_vanished(write, mark):
     )
     listed = write(f"name,x,y\nA,0,0\n{mark}1,9,9\n{mark}2,5,5\n", "stations.csv")
     table = understand_table(write("station,x,y,rssi\n" + rows), {}, listed)
-    assert table.raw.arrays["rssi_db"].tolist() == [-60.0 - i for i in range(27)]
-    assert table.raw.arrays["station"].tolist() == [1, 2, 0] * 9
+    assert table.arrays["rssi_db"].tolist() == [-60.0 - i for i in range(27)]
+    assert table.arrays["station"].tolist() == [1, 2, 0] * 9
     assert f"18 rows begin with '{mark}1' or the like, the first in line 2" in table.notes
 
 
 def test_comments_below_the_heads_are_said(write):
     table = understand_table(write(PLAIN + "# turned back here, see notes\n7,8,9,-70\n"))
-    assert table.raw.arrays["rssi_db"].tolist() == [-80, -81.5, -70]
+    assert table.arrays["rssi_db"].tolist() == [-80, -81.5, -70]
     assert "1 comments below the heads, the first in line 4" in table.notes
 
 
 def test_a_no_break_space_between_columns(write):
     """Cells were counted by one rule and parsed by another: KeyError: 3."""
-    arrays = understand_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).raw.arrays
+    arrays = understand_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
 
 

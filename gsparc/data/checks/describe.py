@@ -138,9 +138,8 @@ def suspicious_values(data: Measurements) -> list[str]:
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
-        places, zones = ends[np.isfinite(ends).all(axis=1)], data.provenance.get("zones", "")
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
-        hints = _units(places, zones) or _units(data.moving[:, :3] + site.origin, zones)
+        hints = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3] + site.origin)
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -165,8 +164,8 @@ def suspicious_values(data: Measurements) -> list[str]:
     return hints
 
 
-def _units(positions: np.ndarray, zones: str) -> list[str]:
-    """Warnings that positions (n, 3), in the world, may not be metres; `zones` is a column of a table."""
+def _units(positions: np.ndarray) -> list[str]:
+    """Warnings that positions (n, 3), in the world, may not be metres."""
     extent, middle = np.ptp(positions, axis=0), np.abs(np.median(positions[:, :2], axis=0))
     height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
     reach = np.abs(positions[:, :2]).max(axis=0)
@@ -178,8 +177,7 @@ def _units(positions: np.ndarray, zones: str) -> list[str]:
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
     groups = outliers.find_gap(positions[:, :2])
     if groups is not None:
-        by = f", as column {zones!r} says" if zones else ""
-        said = f"two groups of places {groups[1] / 1e3:.4g} km apart{by}"
+        said = f"two groups of places {groups[1] / 1e3:.4g} km apart"
         return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
     # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
     if height > 100 or width > 1e4:

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import centre_positions, rounded_rms
-from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
-from gsparc.data.errors import DataError, Problems, explain_error
+from gsparc.data.datasets.campaign import Expected, Release, StandIn, check_layout, load_stand_in, read_split
+from gsparc.data.errors import DataError, Problems, readable
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
-from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
@@ -121,12 +120,8 @@ def _channels(root: Path) -> np.ndarray:
 
 
 def _loaded(path: Path, expected: str) -> np.ndarray:
-    try:
+    with readable(path, "not readable", (ValueError, OSError), f"missing; {expected}"):
         return np.asarray(np.load(path, allow_pickle=False))
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing; {expected}") from None
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable ({explain_error(error)})") from None
 
 
 def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
@@ -151,21 +146,15 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
 
 def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
-        return _true_positions(root / "positions.npy", len(up))
+        path = root / "positions.npy"
+        known = Raw({"rx_position": _loaded(path, "true positions exist in the stand-in only")})
+        layout = {"rx_position": Expected((len(up), 3), place=True)}
+        return check_layout(known, path, layout)["rx_position"].astype(np.float64)
     if of != "encoder":
         raise DataError(f"dataset.positions={of!r}: expected encoder or true")
     # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
     rows = np.arange(len(up)) if split is None else split[0]
     return encode_positions(up, rows)
-
-
-def _true_positions(path: Path, rows: int) -> np.ndarray:
-    places = _loaded(path, "true positions exist in the stand-in only")
-    check = Checker(Raw({"rx_position": places}), str(path))
-    known = check.position("rx_position", rows) if check.fits("rx_position", places, (rows, 3)) else None
-    check.problems.raise_if_any()
-    assert known is not None
-    return known
 
 
 class Argos(Release):

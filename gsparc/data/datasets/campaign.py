@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -20,7 +20,7 @@ from gsparc.data.files import SeveralFiles, read_text
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
-from gsparc.data.raw import Raw, numbered_rows, read_raw
+from gsparc.data.raw import Raw, numbered_rows, read_raw, rename_arrays
 from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
 from gsparc.data.selection import Selection
 
@@ -65,10 +65,8 @@ class Campaign(DataModule):
 
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
-        raw = self.raw()
-        reading = interpret(raw, self.file, self.selection)
-        left_out = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*left_out, *reading.notes):
+        reading = interpret(self.raw(), self.file, self.selection)
+        for note in reading.notes:
             log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)
@@ -272,4 +270,5 @@ def read_converted(path: str | Path, fields: Mapping[str, str], **about: str) ->
     missing = [f"{path}, {name}: missing" for name in fields if name not in raw.arrays]
     if missing:
         raise DataError(missing, path)
-    return Raw({field: raw.arrays[name] for name, field in fields.items()}, {**raw.attributes, **about})
+    listed = {name: raw.arrays[name] for name in fields}
+    return rename_arrays(replace(raw, arrays=listed, attributes={**raw.attributes, **about}), fields)

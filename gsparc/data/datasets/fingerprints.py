@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsparc.data.datasets.campaign import Expected, check_layout
-from gsparc.data.errors import DataError, explain_error, list_first, suggest_nearest
+from gsparc.data.errors import DataError, list_first, readable, suggest_nearest
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
@@ -123,10 +123,8 @@ def _of_table(path: Path, placed: bool) -> Raw:
     """The same arrays of a table with columns WAP001, ..., LONGITUDE, LATITUDE [m], FLOOR, BUILDINGID."""
     import pandas as pd  # half a second
 
-    try:
+    with readable(path, "not readable as CSV text", (ValueError, OSError)):
         frame = pd.read_csv(path, skipinitialspace=True)
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path}: not readable as CSV text ({explain_error(error)})") from None
     names = [name for name in frame.columns if name.startswith("WAP")]
     places = ["LONGITUDE", "LATITUDE"] if placed or "LONGITUDE" in frame else []
     missing = [name for name in places if name not in frame] or ([] if names else ["WAP001"])

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, readable
 from gsparc.data.pickles import read_pickled_frame
 from gsparc.data.raw import Raw, read_raw, rename_arrays
 
@@ -44,7 +44,7 @@ def _of_release(path: Path) -> dict[str, np.ndarray]:
     if missing:
         raise DataError(f"{path}: no columns {', '.join(missing)}; it holds {', '.join(map(str, frame))}")
     whole = [i for i in range(len(frame["CSI"])) if all(_finite(frame[name][i]) for name in COLUMNS)]
-    try:
+    with readable(path, "not the table of a room", (ValueError, TypeError)):
         rows = {name: [np.asarray(frame[name][i]) for i in whole] for name in COLUMNS}
         arrays = {
             "tx_pos": np.stack(rows["TxPos"]).astype(np.float64),
@@ -56,8 +56,6 @@ def _of_release(path: Path) -> dict[str, np.ndarray]:
             "path_gain": np.concatenate([g.ravel() for g in rows["RxChanPerRay"]]).astype(np.complex64),
             "line_of_sight": np.array(rows["LineOfSight"]) != 0,
         }
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{path}: not the table of a room ({error})") from None
     if len(arrays["frequency_hz"]) != 1 or (arrays["tx_pos"] != arrays["tx_pos"][0]).any():
         raise DataError(f"{path}: several transmitters or frequencies; expected one of each in a room")
     arrays |= {"tx_pos": arrays["tx_pos"][0], "frequency_hz": arrays["frequency_hz"][0]}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,14 +18,12 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.datasets.techtile_power import TechtilePower
 from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
-from gsparc.data.errors import Caution, DataError
+from gsparc.data.errors import DataError
 from gsparc.data.files import SeveralFiles
-from gsparc.data.limits import choice, finite_array, or_null, switch
+from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import Noted, Raw, read_raw
+from gsparc.data.raw import Raw, read_raw
 from gsparc.data.tables import is_table
-
-log = logging.getLogger(__name__)
 
 
 def read_own(
@@ -36,7 +33,7 @@ def read_own(
     cell_m: float | None = None,
     **settings: Any,
 ) -> Raw:
-    """Read a file of docs/reference/schema.md, or a table under the schema's names; notes are logged.
+    """Read a file of docs/reference/schema.md, or a table under the schema's names.
 
     Args:
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
@@ -49,13 +46,10 @@ def read_own(
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    raw, notes = read_file_or_table(path, columns, stations_file, cell_m)
-    raw = apply_settings(raw, **settings)
+    raw = apply_settings(read_file_or_table(path, columns, stations_file, cell_m), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
-    for note in notes:
-        log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", path, note)
     return raw
 
 
@@ -82,14 +76,10 @@ def apply_settings(
         **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
-        SettingError: another word for `absent`, or for a convention.
+        SettingError: another word for a convention.
     """
-    choice("auto", "unknown", "silent").check("dataset.absent", absent)
-    said: dict[str, Any] = (
-        {} if not_heard is None else {"not_heard": finite_array(not_heard).reshape(-1).tolist()}
-    )
-    said |= {} if absent == "auto" else {"absent": absent}
-    said |= {} if saturation_db == "auto" else {"saturation_db": saturation_db}
+    settings = {"not_heard": not_heard, "absent": absent, "saturation_db": saturation_db}
+    said: dict[str, Any] = {name: value for name, value in settings.items() if value not in (None, "auto")}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
@@ -146,7 +136,7 @@ def read_any(
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
-        raw, notes = Noted(LOADERS[release](path), (f"this is the release of dataset={release}",))
+        raw, said = LOADERS[release](path), f"this is the release of dataset={release}"
     elif path.is_dir():
         if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
             raise DataError(
@@ -155,11 +145,11 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, notes = read_file_or_table(path, columns, stations_file)
+        raw, said = read_file_or_table(path, columns, stations_file), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
-            raw, notes = Noted(LOADERS[campaign](path), (f"this is a file of dataset={campaign}",))
-    reading = interpret(apply_settings(raw, **settings), path)
-    return Reading(reading.data, (*notes, *reading.notes))
+            raw, said = LOADERS[campaign](path), f"this is a file of dataset={campaign}"
+    raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
+    return interpret(apply_settings(raw, **settings), path)
 
 
 def read_file_or_table(
@@ -167,8 +157,8 @@ def read_file_or_table(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
-) -> Noted:
-    """Read the arrays of a file of the schema, or of a table, and how its columns were understood.
+) -> Raw:
+    """Read the arrays of a file of the schema, or of a table; notes say how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.
@@ -180,7 +170,7 @@ def read_file_or_table(
         named = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
-        return Noted(read_raw(path))
+        return read_raw(path)
     from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
 
     return understand_table(path, columns or {}, stations_file, cell_m)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +54,7 @@ def read_powder(
     Returns:
         `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
         `station_height` () [m], `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name`
-        (T,), `carrier_hz` (); of a CSV also `row_name` (S,). The attribute `left_out` says which columns are
-        no stations.
+        (T,), `carrier_hz` (); of a CSV also `row_name` (S,). A note says which columns are no stations.
 
     Raises:
         DataError: no such file, or something in it is missing or wrong; all problems with line and column.
@@ -67,7 +67,8 @@ def read_powder(
     else:
         raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
-    return Raw({**raw.arrays, **heights}, {"name": "powder", **raw.attributes, "layout": "powder"})
+    about = {"name": "powder", **raw.attributes, "layout": "powder"}
+    return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)
 
 
 def _of_npz(path: Path) -> Raw:
@@ -78,7 +79,7 @@ def _of_npz(path: Path) -> Raw:
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
     latitude, longitude = ((stations - middle) @ turn + mean).T
-    return Raw({**raw.arrays, "station_latitude": latitude, "station_longitude": longitude}, raw.attributes)
+    return replace(raw, arrays={**raw.arrays, "station_latitude": latitude, "station_longitude": longitude})
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
@@ -103,9 +104,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
     assert walk is not None
     rssi = np.stack([level for level in levels if level is not None], axis=1)
     rest = [head for head in sheet.heads if head not in (*columns, LATITUDE, LONGITUDE, TIME)]
-    about = {}
-    if rest:
-        about["left_out"] = shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
+    notes = (shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}"),) if rest else ()
     where = np.array([stations[name] for name in columns])
     arrays = {
         "latitude": walk.across[:, 0], "longitude": walk.across[:, 1],
@@ -114,7 +113,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
         "rssi_db": np.where(rssi == NO_VALUE_DB, np.nan, rssi),
         "row_name": np.array(sheet.rows),
     }  # fmt: skip
-    return Raw(arrays, about)
+    return Raw(arrays, notes=notes)
 
 
 def read_station_places(path: Path) -> dict[str, tuple[float, float]]:

@@ -21,7 +21,7 @@ from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, read
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_netcdf
+from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
@@ -57,14 +57,14 @@ def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
     Returns:
         `tx_position` (S, 3), `station_position` (T, 3) [m], `csi` (S, T) complex that follows
         `exp(-j 2 pi f d / c)`, `mask` (S, T), `run` (S,), `frequency_hz` (); of a NetCDF file also
-        `station_name` (T,) and `row_name` (S,). The attribute `left_out` says which cycles are no rows.
+        `station_name` (T,) and `row_name` (S,). A note says which cycles are no rows.
 
     Raises:
         DataError: no such file, or variables missing or wrong; all problems with array and row.
     """
     path = Path(path)
     if path.suffix.lower() in NETCDF_SUFFIXES:
-        return _of_release(_with_experiments(read_netcdf(path), path), path, antennas)
+        return _of_release(_with_experiments(read_raw(path), path), path, antennas)
     return read_converted(path, NPZ, name="techtile", layout="techtile")
 
 
@@ -99,10 +99,8 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
         raise DataError(f"{path}: no cycle has both a position and a channel; is it another file?")
     run = variables["experiment_id"].astype(str)[experiment]
     number = variables["cycle_id"].astype(str)[cycle]
-    attributes = {"name": "techtile", "layout": "techtile"}
     lost = int((measured & ~placed).sum())
-    if lost:
-        attributes["left_out"] = f"{lost} of {int(measured.sum())} cycles left out: no position"
+    notes = (f"{lost} of {int(measured.sum())} cycles left out: no position",) if lost else ()
     arrays = {
         "tx_position": where[experiment, cycle],
         "station_position": np.asarray(places, dtype=np.float64),
@@ -113,7 +111,7 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
         "frequency_hz": np.array(CARRIER_HZ),
         "row_name": np.array([f"{r} cycle {n}" for r, n in zip(run, number, strict=True)]),
     }
-    return Raw(arrays, attributes)
+    return Raw(arrays, {"name": "techtile", "layout": "techtile"}, notes=notes)
 
 
 def read_antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:

@@ -8,13 +8,14 @@ The same as an npz: rx_position (S, 3) [m], rssi_db (S,) [dBm], frequency_hz () 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, readable
 from gsparc.data.pickles import read_pickle
 from gsparc.data.raw import Raw, read_raw
 
@@ -33,7 +34,7 @@ def read_techtile_power(path: str | Path) -> Raw:
         DataError: no such file, or objects of other classes.
     """
     raw = _of_release(Path(path)) if Path(path).is_dir() else read_raw(path)
-    return Raw(raw.arrays, {"name": "techtile_power", **raw.attributes})
+    return replace(raw, attributes={"name": "techtile_power", **raw.attributes})
 
 
 def _of_release(folder: Path) -> Raw:
@@ -54,16 +55,15 @@ def _of_release(folder: Path) -> Raw:
         "frequency_hz": np.array(CARRIER_HZ),
     }
     lost = f"{(~heard).sum()} of {len(heard)} rows left out: no position, or no power"
-    return Raw(arrays, {} if heard.all() else {"left_out": lost})
+    return Raw(arrays, notes=() if heard.all() else (lost,))
 
 
 def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.ndarray:
     """Attributes (rows, names) of the objects in an array; DataError where one has none of them."""
     held: Any = read_pickle(path, classes, npy=True)
-    try:
+    errors = (AttributeError, KeyError, TypeError, ValueError)
+    with readable(path, f"expected an array of objects with {', '.join(names)}", errors):
         return np.array([[float(one.state[name]) for name in names] for one in held])
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise DataError(f"{path}: expected an array of objects with {', '.join(names)}") from None
 
 
 class TechtilePower(Campaign):

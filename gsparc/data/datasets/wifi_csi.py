@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
-from gsparc.data.errors import DataError, list_first
+from gsparc.data.errors import DataError, list_first, readable
 from gsparc.data.files import read_csv
 from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
@@ -110,11 +110,9 @@ def _table(path: Path) -> pd.DataFrame:
     head = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y"} <= set(head) or not {"file", "time_s"} & set(head):
         raise DataError(f"{path}: columns {', '.join(head)}; expected x, y [m], and file or time_s")
-    try:
+    with readable(path, f"expected numbers in {', '.join(NUMBERS)}", (ValueError, AssertionError)):
         table = pd.DataFrame([row for row in rows[1:] if row], columns=head)
         return table.astype({name: float for name in NUMBERS if name in head})
-    except (ValueError, AssertionError) as error:
-        raise DataError(f"{path}: {error}; expected numbers in {', '.join(NUMBERS)}") from None
 
 
 def _logs(path: Path, card: str | None) -> list[Path]:

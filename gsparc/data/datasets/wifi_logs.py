@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
-from gsparc.data.errors import DataError, explain_error
+from gsparc.data.errors import DataError, readable
 
 SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}
 HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
@@ -69,12 +69,8 @@ def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> 
     card = card or SUFFIXES.get(path.suffix.lower())
     if card not in READERS:
         raise DataError(f"{path}: no log of a known card; say dataset.card={'|'.join(READERS)}")
-    try:
+    with readable(path, f"not readable as a log of {card}", Exception):  # `csiread` raises anything
         packets = READERS[card](path, csiread, chip)
-    except DataError:
-        raise
-    except Exception as error:  # `csiread` raises anything
-        raise DataError(f"{path}: not readable as a log of {card} ({explain_error(error)})") from None
     if not len(packets.csi):
         raise DataError(f"{path}: no packet with a channel in it; is it a log of {card}?")
     return packets

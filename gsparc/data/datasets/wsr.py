@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, readable
 from gsparc.data.files import read_csv
 from gsparc.data.raw import Raw
 
@@ -117,10 +117,8 @@ def read_log(path: Path) -> Log:
     Raises:
         DataError: missing, or its records are of another form.
     """
-    try:
+    with readable(path, "missing; expected the log of each end of a run", OSError):
         content = path.read_bytes()
-    except OSError:
-        raise DataError(f"{path}: missing; expected the log of each end of a run") from None
     records = np.frombuffer(content, RECORD, len(content) // RECORD.itemsize)  # the last may be cut short
     code, antennas, length = EXPECTED
     right = (records["size"] == RECORD.itemsize - 2) & (records["code"] == code)
@@ -148,11 +146,11 @@ def read_log(path: Path) -> Log:
 def _way(path: Path) -> np.ndarray:
     """Time, x, y, z (n, 4) of the robot."""
     rows = read_csv(path, "missing; expected the robot's way")
-    try:
+    with readable(
+        path, "expected lines that begin with the time and end with x, y, z", (ValueError, IndexError)
+    ):
         way = np.array([[cell for cell in row if cell.strip()] for row in rows if row], np.float64)
         return way[:, [0, -3, -2, -1]]
-    except (ValueError, IndexError):
-        raise DataError(f"{path}: expected lines that begin with the time and end with x, y, z") from None
 
 
 def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator[Pair]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.assemble import FARTHEST
 from gsparc.data.links.strongest import StrongestLists, number_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
@@ -35,12 +36,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     """Add to lists of the strongest rows, twice as many as are listed, of stations that they leave out."""
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
-    whole = levels.ndim == 1 and levels.dtype.kind in "iuf" and "mask" not in arrays
+    whole = levels.ndim == 1 and "mask" not in arrays
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return
     moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
+    moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.of(moment, of[heard], levels[heard], moving, count)
     if not lists.recognised():
         return

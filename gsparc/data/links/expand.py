@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.links.absent import add_absent, add_unlisted
-from gsparc.data.links.hearing import POWERS, censor_rows
+from gsparc.data.links.hearing import POWERS, censor_rows, check_said
 from gsparc.data.links.positions import positions_in_metres
 from gsparc.data.links.stations import (
     SECTOR,
@@ -41,11 +41,11 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
         measured: name of the measurement.
         part: of the campaign.
     """
+    check_said(check.raw.attributes)
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
-    if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
-        rows = len(check.raw.arrays[measured])
-        check.raw.arrays.setdefault("row_name", numbered_rows(rows))
-        check.raw.arrays["file_row"] = np.arange(rows)
+    rows = len(check.raw.arrays[measured])  # numbers of the file: rows are repeated and left out below
+    check.raw.arrays.setdefault("row_name", numbered_rows(rows))
+    check.raw.arrays["file_row"] = np.arange(rows)
     well, origin = positions_in_metres(check, measured)
     if not well:
         return None
@@ -65,13 +65,11 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
 
 def _selected(check: Checker, measured: str, stations: Stations | None, part: Selection) -> Stations | None:
     """Leave out what `part` does not hold, and number runs and places anew; the stations that are left."""
-    arrays = check.raw.arrays
-    if arrays[measured].ndim:
-        arrays, stations, notes = select(arrays, measured, stations, part, check.source)
-        check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
-        runs = check.array("run", arrays[measured].shape[:1])
-        arrays |= {} if runs is None else {"run": np.unique(runs, return_inverse=True)[1].reshape(-1)}
-        arrays |= {} if "place" not in arrays else {"place": number_places(arrays["place"])}
+    arrays, stations, notes = select(check.raw.arrays, measured, stations, part, check.source)
+    check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
+    runs = check.array("run", arrays[measured].shape[:1])
+    arrays |= {} if runs is None else {"run": np.unique(runs, return_inverse=True)[1].reshape(-1)}
+    arrays |= {} if "place" not in arrays else {"place": number_places(arrays["place"])}
     return stations
 
 
@@ -81,7 +79,7 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     _selected(check, measured, None, part)
     arrays = check.raw.arrays
-    rows = len(arrays[measured]) if arrays[measured].ndim else 0
+    rows = len(arrays[measured])
     # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
     if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import find_not_heard_marks, find_saturation
 from gsparc.data.errors import Caution
-from gsparc.data.limits import number, or_word
+from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import Links
 from gsparc.data.selection import take_rows
@@ -17,7 +19,25 @@ from gsparc.data.selection import take_rows
 POWERS = ("rssi", "rssi_db")
 NOT_HEARD = "powers were not heard: they lie below sensitivity_db, or the weakest of their list"
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
-SATURATION = or_word(or_word(number(-400, 400), "auto"), "none")  # [dB]
+
+
+def _are_levels(value: Any) -> bool:
+    listed = np.atleast_1d(np.array(value, object)).ravel().tolist()
+    return all(isinstance(one, int | float) and not isinstance(one, bool) and one < np.inf for one in listed)
+
+
+# Of powers that were not measured, by a setting or an attribute of the file: the default, and what may be.
+SAID = {
+    "absent": ("auto", choice("auto", "unknown", "silent")),
+    "not_heard": (None, or_null(Limit("a list of levels [dB] like [-999]", _are_levels))),
+    "saturation_db": ("auto", or_word(or_word(number(-400, 400), "auto"), "none")),
+}
+
+
+def check_said(attributes: Mapping[str, Any]) -> None:
+    """Raise `SettingError` where what is said of powers that were not measured cannot be."""
+    for name, (default, limit) in SAID.items():
+        limit.check(f"dataset.{name}", attributes.get(name, default))
 
 
 def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
@@ -34,12 +54,12 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
         return None
     arrays.pop("sensitivity_db", None)
     mask = arrays.get("mask")
-    if mask is not None and (mask.shape != values.shape or mask.dtype.kind not in "biu"):
+    if mask is not None and mask.shape != values.shape:
         return links  # said where the mask is read
     # A spectrum without power has no directions; where rows have paths they are a simulation's.
     silent = measured == "spectrum" and not is_big(values) and "path_offsets" not in arrays
     gaps = measured in POWERS or links.stations is not None  # what is not a number is missing there
-    if values.dtype.kind not in "iufc" or values.ndim == 0 or not (gaps or mask is not None or silent):
+    if not (gaps or mask is not None or silent):
         return links
     axes = tuple(range(1, values.ndim))
     unknown = np.isnan(values) if gaps else np.zeros(values.shape, bool)
@@ -116,7 +136,8 @@ def _note_floor(
         named = of_row.named([*map(str, check.raw.arrays["row_name"])])[row]
         wrong = f"{named}: rssi_db is {values[row]:.4g}, below {floor[row]:.4g}"
         return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
-    highest, weakest = floor[censored].max(initial=-np.inf), values[known].min(initial=np.inf)
+    # Levels may be whole numbers, among which there is no infinity.
+    highest, weakest = floor[censored].max(initial=-np.inf), values[known].astype(float).min(initial=np.inf)
     if FAR_BELOW_DB < weakest - highest < np.inf:
         check.notes.append(
             f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
@@ -149,7 +170,6 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
 def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
     given = check.raw.attributes.get("saturation_db", "auto")
-    SATURATION.check("dataset.saturation_db", given)
     level = find_saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
     if level is None:
         return np.zeros(len(values), bool)

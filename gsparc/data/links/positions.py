@@ -35,8 +35,8 @@ def _without_fix(check: Checker, measured: str) -> None:
     degrees = "latitude" in arrays
     for name in ("latitude",) if degrees else check.given("rx_position", "tx_position"):
         pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
-        rows = len(arrays[measured]) if arrays[measured].ndim else 0
-        if any(p.ndim != 2 - degrees or len(p) != rows or p.dtype.kind not in "iuf" for p in pair):
+        rows = len(arrays[measured])
+        if any(p.ndim != 2 - degrees or len(p) != rows for p in pair):
             continue
         place = np.column_stack(pair)[:, :2]
         null = (place == 0).all(axis=1)
@@ -58,7 +58,7 @@ def _unknown_at_zero(check: Checker, degrees: bool) -> None:
     """Stations at exactly 0, 0, where rows are elsewhere, stand at places that nobody knows."""
     arrays = check.raw.arrays
     names = ("station_latitude", "station_longitude") if degrees else ("station_position",)
-    if not set(names) <= set(arrays):
+    if not set(names) <= set(arrays) or len({len(arrays[name]) for name in names}) > 1:
         return
     at_zero = np.flatnonzero((np.column_stack([arrays[name] for name in names])[:, :2] == 0).all(axis=1))
     for name in names:
@@ -74,7 +74,7 @@ def _heights(check: Checker) -> bool:
     arrays, before = check.raw.arrays, len(check.problems)
     for end in ("rx", "tx", "station"):
         name, height = f"{end}_position", f"{end}_height"
-        flat = name in arrays and arrays[name].ndim in (1, 2) and arrays[name].shape[-1] == 2
+        flat = name in arrays and arrays[name].shape[-1] == 2
         if not flat:
             if height in arrays:
                 check.refuse(height, f"given, but {name} has three coordinates or is missing")

@@ -66,13 +66,11 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
     """
     arrays = check.raw.arrays
     positions = arrays["station_position"]
-    lost = np.zeros(len(positions) if positions.ndim else 0, bool)
-    if may_miss and positions.ndim == 2 and positions.dtype.kind == "f":
-        lost = np.isnan(positions[:, :2]).all(axis=1)
-        arrays["station_position"] = np.where(lost[:, None], 0, positions)
+    lost = np.isnan(positions[:, :2]).all(axis=1) & may_miss
+    arrays["station_position"] = np.where(lost[:, None], 0, positions)
     places = check.position("station_position", None)
-    if places is None or places.ndim != 2:
-        return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
+    if places is None:
+        return None
     count = len(places)
     places[lost] = np.nan
     names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))

@@ -206,11 +206,10 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(wanted.name, total=sum(source.bytes for source in wanted.sources))
         for name, source in files.items():
-            if not _is_right(wanted.folder / name, source):
-                try:
-                    store.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s, chunk_size=CHUNK))
-                except (requests.RequestException, ValueError) as error:
-                    raise DataError(_fault(source, error, wanted.name)) from None
+            try:  # of what is there, only the hash is taken
+                store.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s, chunk_size=CHUNK))
+            except (requests.RequestException, ValueError) as error:
+                raise DataError(_fault(source, error, wanted.name)) from None
             progress.advance(task, source.bytes)
 
 

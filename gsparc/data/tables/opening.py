@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pandas as pd
 from fsspec.core import url_to_fs
 
-from gsparc.data.errors import Caution, DataError, Problems, explain_error, name_row_ranges
+from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
 from gsparc.data.files import SeveralFiles, check_line_length
 from gsparc.data.tables import TABLE_SUFFIXES
 from gsparc.data.tables.heads import SHEET, understand_head
@@ -36,11 +36,10 @@ def open_parquet(source: str) -> Iterator[Dataset]:
         from pyarrow import ArrowException, dataset
     except ImportError:
         raise DataError(f"{source}: Parquet needs pyarrow; say: pip install 'gsparc[tables]'") from None
-    try:
+    errors = (ArrowException, OSError, ValueError, ImportError)
+    with readable(source, "damaged or not a Parquet file", errors):
         system, at = url_to_fs(source) if "://" in source else (None, source)
         yield dataset.dataset(at, filesystem=system, format="parquet", partitioning="hive")
-    except (ArrowException, OSError, ValueError, ImportError) as error:
-        raise DataError(f"{source}: damaged or not a Parquet file ({explain_error(error)})") from None
 
 
 def read_parquet(source: str, most: int | None = None) -> Sheet:

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.checks.outliers import find_gap
 from gsparc.data.errors import Caution, list_first, suggest_nearest
 from gsparc.data.files import SeveralFiles
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
-from gsparc.data.raw import Noted, Raw
+from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.tables.cells import LOOKED_AT, merge_cells
 from gsparc.data.tables.columns import (
@@ -50,8 +49,8 @@ def understand_table(
     columns: Mapping[str, object] = NOTHING,
     stations_file: str | Path | None = None,
     cell_m: float | None = None,
-) -> Noted:
-    """Read the arrays of a table, and what was guessed.
+) -> Raw:
+    """Read the arrays of a table; notes say what was guessed.
 
     Args:
         path: *.csv, *.tsv, *.txt or *.parquet, or several.
@@ -89,8 +88,7 @@ def understand_table(
         about |= {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
         if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
             about["unit"] = power.unit.name
-    about |= {"zones": builder.zones} if builder.zones else {}
-    return Noted(Raw(arrays, about), (*notes, *guessed, *builder.notes))
+    return Raw(arrays, about, notes=(*notes, *guessed, *builder.notes))
 
 
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
@@ -104,7 +102,7 @@ class Builder:
         self.refuse = sheet.refuse
         self.notes: list[str] = []
         self.arrays: dict[str, np.ndarray] = {}
-        self.tones, self.zones = np.zeros(1, int), ""
+        self.tones = np.zeros(1, int)
 
     def build(self) -> dict[str, np.ndarray]:
         """Return all arrays; what is wrong is in `sheet.problems`."""
@@ -217,7 +215,6 @@ class Builder:
             return
         stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
         moving, where = self._moving(ends, stay)
-        self.zones = self._zones(where)
         others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
             self.arrays["station_name"] = np.array(stations.names)
@@ -234,20 +231,6 @@ class Builder:
                 return self.refuse(f"the places of rows are in {fault}")
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)
-
-    def _zones(self, where: Places) -> str:
-        """Head of a column that tells two groups of places far apart from each other; empty without."""
-        groups = None if where.degrees else find_gap(where.across)
-        if groups is None:
-            return ""
-        used = {column.head for columns in self.chosen.values() for column in columns}
-        for head in [head for head in self.sheet.heads if head not in used]:
-            words = self.sheet.words(head)
-            values = [set(words[side].tolist()) for side in (groups[0], ~groups[0])]
-            # A tenth of the rows: columns with more values number rows or times rather than places.
-            if not values[0] & values[1] and max(map(len, values)) <= len(words) // 10:
-                return head
-        return ""
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""

@@ -26,7 +26,7 @@ from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.raw import read_netcdf
+from gsparc.data.raw import Raw, read_raw, write_raw
 
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
@@ -42,7 +42,7 @@ def test_techtile_release(tmp_path, kind):
     assert held["row_name"][0] == "EXP005 cycle 1" and held["row_name"][-1] == "EXP006 cycle 7"
     assert held["run"].tolist() == ["EXP005"] * CYCLES + ["EXP006"] * (CYCLES - 2)
     assert held["mask"].sum() == 3 * rows - 1 and not held["mask"][3, 2]
-    assert raw.attributes["left_out"] == "1 of 15 cycles left out: no position"
+    assert raw.notes[0] == "1 of 15 cycles left out: no position"
     # The release stores reference minus received phase, which rises with distance.
     expected = channels_of(held["tx_position"])
     assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
@@ -126,15 +126,15 @@ def test_damaged_netcdf(tmp_path, refused, kind):
     whole = path.read_bytes()
     for content in (b"", b"hello", whole[: len(whole) // 2], whole[:40], b"CDF\x05" + whole[4:]):
         path.write_bytes(content)
-        refused("csi.nc: ", read_netcdf, path)
-    refused("no such file", read_netcdf, tmp_path / "other.nc")
+        refused("csi.nc: ", read_raw, path)
+    refused("no such file", read_raw, tmp_path / "other.nc")
 
 
 def test_values_that_were_never_written_are_none(tmp_path):
     variables = release_variables()
     variables["rover_x"][1][0, 2] = 9.969209968386869e36
     raw = read_techtile(write_release(tmp_path, variables=variables))
-    assert raw.attributes["left_out"].startswith("2 of 15 cycles")
+    assert raw.notes[0].startswith("2 of 15 cycles")
     assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
@@ -143,7 +143,7 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
     )
     assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays["rssi_db"].shape == (20, 1)
-    assert "madsen-nuc2-b210" in raw.attributes["left_out"]
+    assert "madsen-nuc2-b210" in raw.notes[0]
 
 
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
@@ -224,3 +224,12 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
     with pytest.raises(DataError, match="this is a file of dataset=ble; say dataset=ble"):
         load({"name": "own", "file": str(file)})
+
+
+def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):
+    """Under their names in the file, which are not the schema's."""
+    with np.load(real("real/ble-hall-2.npz")) as stored:
+        write_raw(tmp_path / "hall.npz", Raw(dict(stored), {}, {"mobile_position": "mm"}))
+    refused(
+        "tx_position: units are 'mm'; expected 'm'", lambda path: read_any(path).data, tmp_path / "hall.npz"
+    )

@@ -110,7 +110,7 @@ def test_logs_that_are_none(robot, tmp_path, refused, monkeypatch):
     table.write_text("file,x,y\nother.dat,1,2\n")
     refused("no packet has a place", read_wifi_csi, robot)
     table.write_text("file,x,y\nrx.dat,1,two\n")
-    refused("places.csv: could not convert", read_wifi_csi, robot)
+    refused("places.csv: expected numbers in .*could not convert", read_wifi_csi, robot)
     table.write_text("file,x,y\nrx.dat,1,2\n")
     refused("say dataset.carrier_hz", read_wifi_csi, robot)
     sound = standard(robot.read_bytes())

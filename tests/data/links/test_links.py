@@ -1,9 +1,13 @@
 """Stations, both ends moving, missing and censored powers: what a file may say, and what it becomes."""
 
+import re
+
 import numpy as np
 import pytest
 
 from gsparc.data.checks.describe import describe, suspicious_values
+from gsparc.data.errors import DataError
+from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.selection import Selection
@@ -251,3 +255,41 @@ def test_one_station_in_degrees_needed_a_column():
     }
     found = interpret(Raw({**degrees, **mast, "rssi_db": LEVELS[:, 0]}, {}), "own")
     assert len(found.data) == PLACES and len(found.data.site.stations) == 1
+
+
+@pytest.mark.parametrize("said", [{"not_heard": "none"}, {"not_heard": [-999, "x"]}, {"absent": "silnt"}])
+def test_what_is_said_of_unheard_powers_was_not_checked(said):
+    """An attribute of text was a traceback; a mark that is no level, or a mistyped word, counted as none."""
+    with pytest.raises(SettingError, match=f"dataset.{next(iter(said))}="):
+        interpret(Raw(town(), said), "town.npz")
+    levels = np.where(np.arange(PLACES) < 4, -np.inf, LEVELS[:, 0])
+    marked = Raw(
+        town(rssi_db=levels, station_position=POSTS[:1], station_name=None), {"not_heard": [-np.inf]}
+    )
+    assert (interpret(marked, "town.npz").data.censored == 1).sum() == 4
+
+
+def test_whole_numbers_beside_a_sensitivity_were_a_traceback():
+    whole = LEVELS.round().astype(np.int64)
+    data = read(town(rssi_db=whole, sensitivity_db=np.array(-99.0))).data
+    assert np.allclose(10 * np.log10(data.target[:, 0] * data.site.target_scale), whole.ravel(), atol=1e-4)
+
+
+FORMS = {  # arrays and attributes, and what is said of them
+    "stations of two counts": (degrees(*(WALK[:, :2] / 1e4 + 40).T, rx_height=1.0,
+        station_latitude=POSTS[:, 0], station_longitude=POSTS[:2, 0]), {}, "station_longitude: expected"),
+    "no levels": (town(rssi_db=np.array(3.0)), {}, r"rssi_db: expected shape \(S,\) or \(S, T\), found \(\)"),
+    "text": (town(rssi_db=LEVELS.astype(str)), {}, "rssi_db: expected real numbers"),
+    "times as places": (town(tx_position=WALK.astype("M8[s]")), {}, "tx_position: expected real numbers"),
+    "a name of two": (town(), {"name": np.array([1.0, 2.0])}, "name: a list; expected text"),
+    "a measurement of two": (town(), {"measurement": np.array(["rssi", "csi"])}, "names no measurement"),
+    "transposed powers": (town(), {"conventions": "transposed"}, "of channels and spectra, not of powers"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FORMS)
+def test_arrays_and_attributes_of_another_form_were_tracebacks(case):
+    arrays, attributes, says = FORMS[case]
+    with pytest.raises(DataError) as caught:
+        interpret(Raw(arrays, attributes), "town.npz")
+    assert any(re.search(says, line) for line in caught.value.problems), caught.value.problems
