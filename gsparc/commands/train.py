@@ -113,6 +113,7 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     """
     method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.of(config)
+    tracking.refuse_missing_loggers(config)
     watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
     with heeded.recording(reads):
         module = _data(config, known)

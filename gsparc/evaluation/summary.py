@@ -33,6 +33,7 @@ PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "sci
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 MOST_LEARNED = 3  # notes of a fit below the table; the log has all
+RIGHT_CHI2 = 0.25, 4.0  # std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -123,7 +124,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
-    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
+    chi2 = {str(facts.get("model/label")): facts.get(f"{prefix}/{CALIBRATION}")}
+    wrong = wrong_deviations(chi2, facts.get("dataset/kind"))
+    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
@@ -186,6 +189,25 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
         f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they describe "
         f"little else. The median row's NMSE is {median:.3g}"
     ]
+
+
+def wrong_deviations(chi2: Mapping[str, float | None], kind: str | None) -> list[str]:
+    """Return methods whose `std` is wrong by a factor of two or more, by their reduced chi-squared, if any.
+
+    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "csi")[0][:30]
+    'std of field is 5 times too sm'
+    """
+    low, high = RIGHT_CHI2
+    # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
+    far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
+    said = [
+        f"of {n} is {max(x, 1 / x) ** 0.5:.2g} times too {'large' if x < 1 else 'small'}"
+        for n, x in far.items()
+    ]
+    tested = "gsparc map ckpt=FILE has tested intervals"
+    if kind != "rssi":
+        tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
+    return [f"std {', '.join(said)}: it orders answers, but is no error bar here; {tested}"] if said else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

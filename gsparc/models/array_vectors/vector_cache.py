@@ -29,6 +29,9 @@ def _kept(key: str) -> dict[int, tuple[Any, ...]]:
     return {}
 
 
+forget_vectors = _kept.cache_clear  # before what is to pay for its own work
+
+
 def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
     """Return array vectors of the given rows, and the seconds they took when computed.
 
