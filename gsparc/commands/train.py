@@ -43,7 +43,7 @@ from gsparc.evaluation.experiment.done import (
 )  # fmt: skip
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
-from gsparc.evaluation.metric_formats import DECIDING, score_of
+from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
@@ -376,7 +376,7 @@ def task(config: DictConfig) -> float:
                 title = f"{made}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
-    figure = DECIDING[facts["dataset/kind"]]
+    figure = deciding_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
         return score_of(figure, value)

@@ -125,7 +125,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
     chi2 = {str(facts.get("model/label")): facts.get(f"{prefix}/{CALIBRATION}")}
-    wrong = wrong_deviations(chi2, facts.get("dataset/kind"))
+    wrong = wrong_deviations(chi2, deciding_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
@@ -191,23 +191,21 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     ]
 
 
-def wrong_deviations(chi2: Mapping[str, float | None], kind: str | None) -> list[str]:
+def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
     """Return methods whose `std` is wrong by a factor of two or more, by their reduced chi-squared, if any.
 
-    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "csi")[0][:30]
+    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0][:30]
     'std of field is 5 times too sm'
     """
     low, high = RIGHT_CHI2
     # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
     far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
-    said = [
-        f"of {n} is {max(x, 1 / x) ** 0.5:.2g} times too {'large' if x < 1 else 'small'}"
-        for n, x in far.items()
-    ]
+    factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
+    said = ", ".join(f"of {name} is {times:.2g} times too {side}" for name, times, side in factors)
     tested = "gsparc map ckpt=FILE has tested intervals"
-    if kind != "rssi":
+    if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    return [f"std {', '.join(said)}: it orders answers, but is no error bar here; {tested}"] if said else []
+    return [f"std {said}: it orders answers, but is no error bar here; {tested}"] if said else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

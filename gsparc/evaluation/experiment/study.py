@@ -18,7 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, run_once
 from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
-from gsparc.evaluation.metric_formats import DECIDING
+from gsparc.evaluation.metric_formats import DECIDING, WITH_SILENT
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
@@ -175,7 +175,7 @@ class Study:
     ) -> None:
         """One training per condition that changes what is learned from, scored under all of them."""
         # Each round has another seed, of the draws of errors as well as of the method.
-        seed, figure, facts = self.seed + turn, DECIDING[data.site.scored], dict[str, Any]()
+        seed, figure, facts = self.seed + turn, "", dict[str, Any]()
         fits: dict[Condition, FoldFits] = {}
         for condition in self.conditions:
             learned = condition.learned
@@ -192,6 +192,8 @@ class Study:
             outcome = fits[learned]
             if condition.what == "query":
                 outcome = outcome.with_scores(condition.tested_on(data, split, seed), split)
+            # Where rows were silent they count, as in every other table.
+            figure = WITH_SILENT if WITH_SILENT in outcome.figures else DECIDING[data.site.scored]
             folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),

@@ -189,9 +189,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
-    lines += wrong_deviations(
-        {row.method: row.chi2 for row in rows}, "rssi" if "rmse" in first.figure else None
-    )
+    lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
         lines.append(f"measured with another program (at commit): {old}")

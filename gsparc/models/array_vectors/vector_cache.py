@@ -75,6 +75,6 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
     if len(bad):
         more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         log.warning(
-            "%d spectra do not fit this array (see %s): %s%s",
+            "%d spectra are none that this array can make (array_position? a fault? see %s): %s%s",
             len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip
