@@ -194,7 +194,7 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     """The data, read or known, in coordinates and units of the model that training starts from, if any."""
     path, start = config.ckpt_path, config.get("init_from")
     if path is not None and not Path(path).exists():  # before anything is read or simulated
-        raise ValueError(f"ckpt_path={path}: no such file")
+        raise ValueError(f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt")
     module = datamodule(config.dataset)
     if known is not None:
         module.measurements = known
@@ -358,7 +358,7 @@ def task(config: DictConfig) -> float:
     hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
     if config.ckpt_path is not None:
         words = " ".join(hydra.overrides.task)
-        log.info("with the settings of the run that it goes on from: %s", words)
+        log.info("going on with the settings of the interrupted run: %s", words)
     with locked(run_dir / ".job"):  # the run's own is its training's
         unread = State.unread(config) if job else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None

@@ -24,6 +24,7 @@ from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import move_rows
+from gsparc.prediction.pareto import defined_figure
 from gsparc.prediction.timing import (
     ClockSettings,
     cycle_queries,
@@ -197,7 +198,7 @@ class Study:
             folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
-                "value": _value(outcome, figure), "train_s": float(np.mean(outcome.train_s)),
+                "value": defined_figure(outcome.figures, figure), "train_s": float(np.mean(outcome.train_s)),
                 "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
                 "effects": str(outcome.methods[0].effects or "none"),
             }  # fmt: skip
@@ -224,13 +225,6 @@ class Study:
         times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [median_and_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
-
-
-def _value(outcome: FoldFits, figure: str) -> float:
-    value = outcome.figures[figure]
-    if value is None:
-        raise ValueError(f"{figure} is not defined on these test rows")
-    return value
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from gsparc.evaluation.metric_formats import (
     score_heading,
 )
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import BUSY, wrong_deviations
+from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Table, value_with_error
 
 SECOND: dict[Scored, str] = {
@@ -193,13 +193,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
         lines.append(f"measured with another program (at commit): {old}")
-    load = block.load[block.budget_s.notna()].max()
-    if load > BUSY:
-        lines.append(
-            f"the machine was busy (load up to {load:.1f} per core): train s/fold is inflated, "
-            "cpu s/fold is what was spent"
-        )
-    return lines
+    return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:

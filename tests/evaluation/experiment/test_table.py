@@ -101,7 +101,7 @@ def test_losers_are_not_hidden():
     assert "never run was not run: no verdict" in absent and "baseline wins" not in absent
     assert "gsparc is 0.50 dB behind gp, within the seeds' spread" in said
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
-    assert "busy (load up to 3.0 per core)" in said
+    assert "busy (load 0.1 to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
     said = " | ".join(remarks(split_by_problem(average_cells(far, {}))[0], "gsparc"))
     assert "2.00 dB behind gp" in said and "spread" not in said
