@@ -61,9 +61,7 @@ def defined_figure(figures: Mapping[str, float | None], name: str) -> float:
         ValueError: the rows that were scored do not define it.
     """
     if (value := figures[name]) is None:
-        raise ValueError(
-            f"{name} is not defined on these test rows, as nothing was heard there: say another split="
-        )
+        raise ValueError(f"{name} is not defined on these test rows (all silent?): say another split=")
     return value
 
 
