@@ -26,7 +26,6 @@ from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
-SURE = 0.95  # probability below the upper end of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
 
@@ -156,8 +155,8 @@ def place_station(
     )  # fmt: skip
     old_outage = np.nan_to_num(now.outage[grid.inside], nan=1.0)
     error = error or NewStationError()
-    # Student's t, as few stations tell the deviation: with the normal's 1.645 intervals held too little.
-    reach = float(t.ppf(SURE, max(error.stations, 1))) * error.offset_db
+    # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
+    reach = float(t.ppf(0.95, max(error.stations, 1))) * error.offset_db
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
