@@ -65,21 +65,25 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     """Return tables of confidences side by side, and of bounds beside what came of them."""
     curves = [
         Column("confidence", "", of="kind"), Column("area under risk-coverage", of="area"),
-        Column("below distance", ".0%", of="area_below_distance"),
-        Column("risk at 70 %", of="risk_at_70"), Column("rank", ".2f", of="rank_correlation"),
+        Column("less than of distance", ".0%", of="area_below_distance"),
+        Column("mean error of the surest 70 %", of="risk_at_70"),
+        Column("rank correlation", ".2f", of="rank_correlation"),
     ]  # fmt: skip
     kinds = [{"kind": kind, **facts_under(facts, f"confidence/{kind}")} for kind in NAMES]
     draws = [
-        Column("split", "", of="how"), Column("confidence", "", of="kind"),
+        Column("parted by", "", of="how"), Column("confidence", "", of="kind"),
         Column("accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
-        Column("broken", ".1%", of=_broken), Column("of all draws", ".1%", of="broken_of_all"),
-        Column("promised", ".0%", of=lambda row: facts["promise/delta"]),
-        Column("accepted nobody", ".0%", of="silent"),
+        Column("sets that accepted none", ".0%", of="silent"),
+        Column("of the others, broken by", ".1%", of=_broken),
+        Column("of all, broken by", ".1%", of="broken_of_all"),
+        Column("promised at most", ".0%", of=lambda row: facts["promise/delta"]),
     ]  # fmt: skip
     # Spatial draws are left out where the patches are too few.
     trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
-    heading = f"{facts['dataset/name']}: {facts['positions']} positions of {facts['model/name']}"
-    promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
+    of = f"{facts['dataset/name']}, {facts['positions']} test positions of {facts['model/name']}"
+    heading = f"{of}: which confidence orders errors best (a smaller area is better)"
+    kept = f"of accepted answers at most {facts['promise/alpha']:.0%} have an error above"
+    promise = f"Is the promise kept, {kept} {facts['promise/limit_db']:g} dB? By random calibration sets"
     return [
         Table.of(heading, curves, [row for row in kinds if "area" in row]),
         Table.of(promise, draws, [row for row in trials_of if "coverage" in row]),

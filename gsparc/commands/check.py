@@ -12,6 +12,10 @@ from rich.console import Console
 
 from gsparc.data.errors import Caution, DataError, group_warnings
 
+TILTED = (
+    "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the list of "
+    "stations and dataset.columns.height=1.5 for places, or expect no more of the tilts than of azimuths"
+)
 SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
 
 
@@ -51,6 +55,12 @@ def check(
     warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
+    if any(" row " in warning for warning in warnings):
+        topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
+    stations, heights = reading.data.site.stations, reading.data.moving[:, 2::3]
+    if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
+        # Of beams that point down nothing is known where both ends are at one height.
+        warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
     for topic, sentence in [*topics, *(("warning", warning) for warning in group_warnings(warnings))]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:

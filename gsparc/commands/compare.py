@@ -34,6 +34,7 @@ from gsparc.evaluation.experiment.table import (
     title_of,
 )
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.models.array_vectors.vector_cache import forget_vectors
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +74,7 @@ def task(config: DictConfig) -> pd.DataFrame:
 def train_cell(one: PreparedCell, left: str | None) -> None:
     """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
     config = deepcopy(one.config)
+    forget_vectors()  # solved for another cell, they would be missing from this one's processor seconds
     # What an interrupted try has left is gone on from, unless the settings name something else.
     config.ckpt_path = config.ckpt_path or left
     _, made = train(config, one.folder, read_inputs(config, one.problem.data), in_full=False)

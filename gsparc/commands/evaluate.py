@@ -62,11 +62,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     evaluation, data, split = evaluate_files(
-        paths,
-        plain(config.dataset),
-        plain(config.split),
-        eval_on=config.eval_on,
-        baselines=config.baselines,
+        paths, plain(config.dataset), plain(config.split), eval_on=config.eval_on, baselines=config.baselines
     )
     # All folds of a run share its configuration, and so its seed.
     seed = checkpoint.read(paths[0]).configuration.get("seed")

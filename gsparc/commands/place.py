@@ -59,6 +59,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         f"with a station at {where}: {found.coverage[0]:.1%} "
         f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%})",
     ]
-    if not error.stations:
+    if error.stations:
+        lines[-1] += f", which counts how far {error.stations} stations left out were off as a whole"
+    else:
         lines.append("the interval knows nothing of a whole station's offset: no station was left out")
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

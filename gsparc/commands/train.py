@@ -43,7 +43,7 @@ from gsparc.evaluation.experiment.done import (
 )  # fmt: skip
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
-from gsparc.evaluation.metric_formats import DECIDING, score_of
+from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
@@ -113,6 +113,7 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     """
     method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.of(config)
+    tracking.refuse_missing_loggers(config)
     watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
     with heeded.recording(reads):
         module = _data(config, known)
@@ -193,7 +194,7 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     """The data, read or known, in coordinates and units of the model that training starts from, if any."""
     path, start = config.ckpt_path, config.get("init_from")
     if path is not None and not Path(path).exists():  # before anything is read or simulated
-        raise ValueError(f"ckpt_path={path}: no such file")
+        raise ValueError(f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt")
     module = datamodule(config.dataset)
     if known is not None:
         module.measurements = known
@@ -357,7 +358,7 @@ def task(config: DictConfig) -> float:
     hydra, run_dir, job = HydraConfig.get(), run_directory(), in_multirun()
     if config.ckpt_path is not None:
         words = " ".join(hydra.overrides.task)
-        log.info("with the settings of the run that it goes on from: %s", words)
+        log.info("going on with the settings of the interrupted run: %s", words)
     with locked(run_dir / ".job"):  # the run's own is its training's
         unread = State.unread(config) if job else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
@@ -375,7 +376,7 @@ def task(config: DictConfig) -> float:
                 title = f"{made}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
-    figure = DECIDING[facts["dataset/kind"]]
+    figure = deciding_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
         return score_of(figure, value)

@@ -54,12 +54,9 @@ class FittedBaseline:
 
 
 def fit_baseline(
-    name: str,
-    data: Measurements,
-    split: Split,
-    eval_on: str = "test",
+    name: str, data: Measurements, split: Split, eval_on: str = "test",
     learned: tuple[Measurements, Split] | None = None,
-) -> FittedBaseline:
+) -> FittedBaseline:  # fmt: skip
     """Fit the baseline `name` with its default settings on each fold, and score it.
 
     Args:

@@ -51,18 +51,11 @@ class Evaluation:
 
 
 def evaluate(
-    methods: Method | Sequence[Method],
-    train_s: float | Sequence[float] | None,
-    data: Measurements,
-    split: Split,
-    *,
-    eval_on: str = "test",
-    baselines: Sequence[str] | None = None,
-    clock: ClockSettings | None = None,
-    learned: tuple[Measurements, Split] | None = None,
-    shared: str | None = None,
-    timed: bool = True,
-) -> Evaluation:
+    methods: Method | Sequence[Method], train_s: float | Sequence[float] | None, data: Measurements,
+    split: Split, *, eval_on: str = "test", baselines: Sequence[str] | None = None,
+    clock: ClockSettings | None = None, learned: tuple[Measurements, Split] | None = None,
+    shared: str | None = None, timed: bool = True,
+) -> Evaluation:  # fmt: skip
     """Score and time a method beside the baselines.
 
     Args:

@@ -81,6 +81,16 @@ def axis_of(name: str) -> str:
     return heading_of(name).replace(" dB", " [dB]")
 
 
+def score_heading(name: str) -> str:
+    """Return the heading of a figure that methods are placed by, ratios in decibels, with what is better.
+
+    >>> score_heading("nmse"), score_heading("psnr_db")
+    ('NMSE dB (less is better)', 'PSNR dB')
+    """
+    ratio = " dB" if _look_up(name).better == "ratio" else ""
+    return f"{heading_of(name)}{ratio}{' (less is better)' if lower_is_better(name) else ''}"
+
+
 def form_of(name: str) -> str:
     """Format of its numbers."""
     return _look_up(name).form

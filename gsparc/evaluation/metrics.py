@@ -162,7 +162,7 @@ class ChannelMetrics(SampleMetric):
         """See the base class."""
         silent = int((samples["target_power"] == 0).sum())
         if silent:
-            log.warning("%d of %d channels are silent: left out of snr_db", silent, len(samples["mse"]))
+            log.warning("%d of %d channels are all zero: left out of snr_db", silent, len(samples["mse"]))
         return {
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),

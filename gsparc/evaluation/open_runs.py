@@ -91,20 +91,15 @@ class Opened:
         if "model" not in config:
             raise DataError(f"{self.stored[0].path} does not say how it was trained")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
-        factory, context = (
-            build(config["model"], trusted=False),
-            FitContext(**effort_settings(config) | others),
-        )
+        factory = build(config["model"], trusted=False)
+        context = FitContext(**effort_settings(config) | others)
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
 
 def open_files(
-    paths: Sequence[str | Path],
-    dataset: Mapping[str, Any] | None = None,
-    split: Mapping[str, Any] | None = None,
-    *,
-    others_whole: bool = False,
-) -> Opened:
+    paths: Sequence[str | Path], dataset: Mapping[str, Any] | None = None,
+    split: Mapping[str, Any] | None = None, *, others_whole: bool = False,
+) -> Opened:  # fmt: skip
     """Load checkpoints of one run, one per fold, and their data.
 
     Args:
@@ -363,14 +358,9 @@ def collect_evidence(
 
 
 def calibrate_and_store(
-    path: str,
-    dataset: dict[str, Any],
-    split: dict[str, Any],
-    promise: Guarantee,
-    kind: str,
-    spatial: bool,
+    path: str, dataset: dict[str, Any], split: dict[str, Any], promise: Guarantee, kind: str, spatial: bool,
     seed: int,
-) -> tuple[confidence.Trusted, str]:
+) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]

@@ -8,7 +8,7 @@ import math
 import platform
 import re
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -33,6 +33,7 @@ PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "sci
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 MOST_LEARNED = 3  # notes of a fit below the table; the log has all
+RIGHT_CHI2 = 0.25, 4.0  # std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -123,7 +124,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
-    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
+    chi2 = {str(facts.get("model/label")): facts.get(f"{prefix}/{CALIBRATION}")}
+    wrong = wrong_deviations(chi2, deciding_figure(facts, prefix))
+    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
@@ -166,11 +169,15 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
             repeat = f"budget_clock=processor does not count what others do, {repeat}"
         conditions.append(f"the time limit ended training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
-    if load is not None and load > BUSY:
-        conditions.append(
-            f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so"
-        )
-    return conditions
+    return conditions + busy_machine([] if load is None else [load])
+
+
+def busy_machine(loads: Sequence[float]) -> list[str]:
+    """Return that the machine was busy, where one of its 1-minute loads per core (n,) says so."""
+    if max(loads, default=0.0) <= BUSY:
+        return []
+    ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))
+    return [f"the machine was busy (load {ends} per core): times are inflated, ratios less so"]
 
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -186,6 +193,23 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
         f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they describe "
         f"little else. The median row's NMSE is {median:.3g}"
     ]
+
+
+def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
+    """Return methods whose `std` is wrong by a factor of two or more, by their reduced chi-squared, if any.
+
+    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0][:30]
+    'std of field is 5 times too sm'
+    """
+    low, high = RIGHT_CHI2
+    # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
+    far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
+    factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
+    said = ", ".join(f"of {name} is {times:.2g} times too {side}" for name, times, side in factors)
+    tested = "gsparc map ckpt=FILE has tested intervals"
+    if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
+        tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
+    return [f"std {said}: it orders answers, but is no error bar here; {tested}"] if said else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

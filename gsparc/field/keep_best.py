@@ -57,7 +57,7 @@ class KeepBest(L.Callback):
         self.looks += not trainer.sanity_checking
         if self.looks == self.patience and not self.step:
             trainer.should_stop = True
-            log.info("gradient steps: %d looks without a sure gain, training ends", self.looks)
+            log.info("gradient steps: no significant gain in %d validations, training ends", self.looks)
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Go back to the best; also after a checkpoint with every step done."""

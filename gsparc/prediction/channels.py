@@ -202,7 +202,7 @@ def _separator(method: Method) -> SeparatesPaths:
 def _heard(method: Method, site: Site, uplink: Any) -> Query:
     """Uplinks (B, U, L) or (U, L) in physical units, from places that nobody says."""
     if not isinstance(method, UplinkMethod):
-        raise ValueError(f"uplink=: {method.name} reads no uplink, it predicts at positions")
+        raise ValueError(f"uplink=: {method.name} reads no uplink; give tx= or rx=")
     if site.uplink_array is None or site.uplink_hz is None:
         raise ValueError(f"uplink=: {site.name} has no uplink")
     shape = (len(site.uplink_array), len(site.uplink_hz))

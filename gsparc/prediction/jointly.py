@@ -78,7 +78,8 @@ class JointMixin:
         >>> np.random.default_rng(0).multivariate_normal(level, covariance, 100).shape
         (100, 2)
         """
-        places = self.queries.query(tx, rx, torch.float64).query.places(self.site)
+        query = self.queries.query(tx, rx, torch.float64).query
+        places = query.places(self.site)
         known = self.method.joint() if isinstance(self.method, OneStationView) else None
         if isinstance(self.method, OneStationView) and known is not None:
             station = torch.full((len(places),), self.method.number)
@@ -87,5 +88,7 @@ class JointMixin:
         process = self.method.process() if isinstance(self.method, HasProcess) else None
         if process is None:
             return None
+        # Who learned all stations together tells them by their places: there both ends are a query's.
+        places = query.places(getattr(self.method, "site", None) or self.site)
         covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]
         return covariance.numpy(), process.kernel.amplitude * process.kernel.noise

@@ -40,11 +40,8 @@ class Point:
     size: int = 0
 
     def value(self, figure: str) -> float:
-        """Return a figure; `ValueError` when these rows do not define it."""
-        result = self.figures[figure]
-        if result is None:
-            raise ValueError(f"{figure} is not defined on these rows")
-        return result
+        """Return a figure; errors as in `defined_figure`."""
+        return defined_figure(self.figures, figure)
 
     @property
     def p50(self) -> float:
@@ -55,6 +52,17 @@ class Point:
     def p95(self) -> float:
         """95th percentile of the latency [ms]."""
         return float(np.quantile(self.ms, 0.95))
+
+
+def defined_figure(figures: Mapping[str, float | None], name: str) -> float:
+    """Return a figure of merit.
+
+    Raises:
+        ValueError: the rows that were scored do not define it.
+    """
+    if (value := figures[name]) is None:
+        raise ValueError(f"{name} is not defined on these test rows (all silent?): say another split=")
+    return value
 
 
 def worded(settings: Settings) -> str:

@@ -252,6 +252,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     ) -> Any:  # fmt: skip
         """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
+        All three axes are there for one antenna or tone, too: of measured channels (B, K) take `[:, 0]`.
+
+        >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
+        >>> near = gsparc.fit(rx=places, tx=[9.0, 9.0, 2.6], csi=heard, frequency_hz=tones, model="nearest")
+        >>> near.csi(rx=places).shape, (near.csi(rx=places)[:, 0] - heard).shape
+        ((60, 1, 2), (60, 2))
+
         Args:
             tx, rx: positions; where the model reads a fresh uplink, none.
             uplink: (B, U, L) or (U, L) complex channels heard now, for a model that reads them.

@@ -53,10 +53,9 @@ BLOCKS = ClockSettings(rounds=40, warmup=0, budget_s=60.0, calls=4, untimed=1)
 
 
 def time_interleaved(
-    contenders: Mapping[Key, Call],
-    settings: ClockSettings | None = None,
+    contenders: Mapping[Key, Call], settings: ClockSettings | None = None,
     threads: Mapping[Key, int] | None = None,
-) -> dict[Key, np.ndarray]:
+) -> dict[Key, np.ndarray]:  # fmt: skip
     """Measure wall times (rounds * calls,) [ms] of each contender.
 
     Rounds alternate so that a competing process hits all of them alike; each timed call is given another

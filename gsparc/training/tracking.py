@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,18 @@ class PartLogger(Logger):
     def save(self) -> None:
         """Write what was logged."""
         self.whole.save()
+
+
+def refuse_missing_loggers(config: DictConfig) -> None:
+    """Refuse a dashboard whose package is missing, before hours of reading and training.
+
+    Raises:
+        ValueError: TensorBoard is not installed.
+    """
+    if "tensorboard" in (config.get("logger") or {}) and not find_spec("tensorboard"):
+        raise ValueError(
+            'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
+        )
 
 
 @contextmanager
@@ -111,19 +124,10 @@ def _of_job() -> dict[str, Any]:
 
 
 def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:
-    """Return a logger for `logger=tensorboard`; event files go to `save_dir/name`.
-
-    Raises:
-        ValueError: TensorBoard is not installed.
-    """
+    """Return a logger for `logger=tensorboard`; event files go to `save_dir/name`."""
     from lightning.pytorch.loggers import TensorBoardLogger
 
-    try:
-        return TensorBoardLogger(save_dir, name=name, version="", default_hp_metric=False)
-    except ModuleNotFoundError:
-        raise ValueError(
-            'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
-        ) from None
+    return TensorBoardLogger(save_dir, name=name, version="", default_hp_metric=False)
 
 
 def log_final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:

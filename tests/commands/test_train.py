@@ -148,12 +148,11 @@ def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_fil
 
 
 def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monkeypatch):
-    def absent(*unused, **named):
-        raise ModuleNotFoundError("No module named 'tensorboard'")
-
-    monkeypatch.setattr("lightning.pytorch.loggers.TensorBoardLogger", absent)
+    """It was, but only after the data were read."""
+    monkeypatch.setattr("gsparc.training.tracking.find_spec", lambda name: None)
+    monkeypatch.setattr("gsparc.commands.train.datamodule", None)
     folders = [f"logger.{name}.save_dir='{tmp_path}'" for name in ("csv", "tensorboard")]
-    with pytest.raises(Exception, match="TensorBoard is not installed") as error:
+    with pytest.raises(ValueError, match="TensorBoard is not installed") as error:
         train(compose(*brief(spectra_file), "logger=tensorboard", *folders), tmp_path)
     message = "logger=tensorboard: TensorBoard is not installed; say pip install"
     assert error_in_one_line(error.value).startswith(message)

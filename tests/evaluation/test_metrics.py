@@ -140,7 +140,7 @@ def test_hard_case_silent_channel(caplog):
     target[1] = 0
     prediction[2] = 0
     figures = summarise(ChannelMetrics(), prediction, target)
-    assert figures["silent_samples"] == 1 and "1 of 5 channels are silent" in caplog.text
+    assert figures["silent_samples"] == 1 and "1 of 5 channels are all zero" in caplog.text
     assert all(value is not None and math.isfinite(value) for value in figures.values())
     nothing = summarise(ChannelMetrics(), prediction, torch.zeros_like(target))
     assert nothing["nmse"] is None and nothing["snr_db"] is None and nothing["nmse_scalar"] is None

@@ -62,7 +62,7 @@ def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tm
     method = build(compose(*brief(measured[0], *wild)).model).create_for(data)
     method.fit(data, fold, FitContext(tmp_path, batch_size=8))
     assert method.steps == 0 and method.steps_taken == PATIENCE * (60 // LOOKS)
-    assert f"{PATIENCE} looks without a sure gain" in caplog.text
+    assert f"no significant gain in {PATIENCE} validations" in caplog.text
 
 
 def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):

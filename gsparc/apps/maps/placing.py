@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.intervals import Evidence
@@ -26,7 +26,6 @@ from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
-SURE = 1.645  # deviations of a 90 % interval
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
 
@@ -156,12 +155,14 @@ def place_station(
     )  # fmt: skip
     old_outage = np.nan_to_num(now.outage[grid.inside], nan=1.0)
     error = error or NewStationError()
+    # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
+    reach = float(t.ppf(0.95, max(error.stations, 1))) * error.offset_db
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
         goals = np.empty(3)
         # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
-        for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
+        for k, shift in enumerate((0.0, -reach, reach)):
             wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
             outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
             goals[k] = np.mean(1 - np.minimum(old_outage, outage))

@@ -54,7 +54,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     check.notes.append(
         f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
         f" below its weakest, in others below {floor.min():.4g} dB; {len(below)} such rows beside"
-        f" {len(heard)} listed, those that tell most (dataset.absent=unknown takes none)"
+        f" {len(heard)} listed, those that say most of a station (dataset.absent=unknown takes none)"
     )
 
 

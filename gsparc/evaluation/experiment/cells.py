@@ -98,11 +98,9 @@ class Budget:
 
 
 def plan_cells(
-    problems: Sequence[Problem],
-    methods: Mapping[str, Contender],
-    budgets: Sequence[Budget],
+    problems: Sequence[Problem], methods: Mapping[str, Contender], budgets: Sequence[Budget],
     only: Sequence[str] = (),
-) -> list[tuple[Problem, Cell]]:
+) -> list[tuple[Problem, Cell]]:  # fmt: skip
     """All cells, the most useful first: every problem's table before further seeds and longer budgets.
 
     Args:

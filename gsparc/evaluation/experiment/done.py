@@ -112,13 +112,9 @@ def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, 
 
 
 def run_once(
-    folder: Path,
-    state: State,
-    work: Callable[[str | None], object],
-    *,
-    reuse: bool = False,
+    folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
     again: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a cell, which is done now where it is not done.
 
     Args:

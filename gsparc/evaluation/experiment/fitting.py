@@ -19,7 +19,8 @@ from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
-from gsparc.evaluation.results import result_rows, score_db
+from gsparc.evaluation.metric_formats import form_of
+from gsparc.evaluation.results import result_rows
 from gsparc.models.checkpoint import MODEL
 
 log = logging.getLogger(__name__)
@@ -153,7 +154,8 @@ def run_cells(
                 continue
             found[str(result.cell)] = result
             row = result.row
-            log.info("%s: %.2f dB after %.1f s", result.cell, score_db(row), row["train_s"])
+            value = format(row["value"], form_of(row["figure"]))
+            log.info("%s: %s %s after %.1f s", result.cell, row["figure"], value, row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None

@@ -97,14 +97,10 @@ def fold_contexts(whole: FitContext, split: Split) -> list[FitContext]:
 
 
 def fit_folds(
-    factory: MethodFactory,
-    data: Measurements,
-    split: Split,
-    contexts: Sequence[FitContext],
-    *,
+    factory: MethodFactory, data: Measurements, split: Split, contexts: Sequence[FitContext], *,
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Method, FitReport], None] | None = None,
-) -> FoldFits:
+) -> FoldFits:  # fmt: skip
     """Fit an unfitted method on every fold; `FoldFits.with_scores` scores them together.
 
     Args:

@@ -11,8 +11,8 @@ import pandas as pd
 from matplotlib.artist import Artist
 
 from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
-from gsparc.evaluation.experiment.table import SCORE, methods_by_mean_behind
-from gsparc.evaluation.metric_formats import axis_of, lower_is_better
+from gsparc.evaluation.experiment.table import methods_by_mean_behind, shown
+from gsparc.evaluation.metric_formats import axis_of, lower_is_better, score_heading
 
 # Fits that only keep rows take microseconds: decades of a logarithmic axis for them alone.
 LEAST_S = 1e-3  # faster fits are drawn here
@@ -38,7 +38,10 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
             axis = free.pop(0)
             _panel(axis, own, horizontal, ours)
             axis.set(title=f"{own.dataset.iloc[0]}, {own.split.iloc[0]}", xlabel=label)
-        line[0].set_ylabel(SCORE[here.figure.iloc[0]])
+        figure_name = here.figure.iloc[0]
+        line[0].set_ylabel(score_heading(figure_name))
+        if lower_is_better(figure_name):
+            line[0].invert_yaxis()  # of the whole line: better is up in every panel
         for axis in free:
             axis.set_visible(False)
     handles: dict[str, Artist] = {}
@@ -58,7 +61,8 @@ def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
         own = own.sort_values("budget_s", na_position="first")
         style = style_of(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
         x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
-        axis.errorbar(x, own.score_db, spread, label=name, **style)
+        level = [shown(*one) for one in zip(own.figure, own.score_db, strict=True)]
+        axis.errorbar(x, level, spread, label=name, **style)
     set_log_axis(axis, fine=False)
 
 

@@ -18,12 +18,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, run_once
 from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
-from gsparc.evaluation.metric_formats import DECIDING
+from gsparc.evaluation.metric_formats import DECIDING, WITH_SILENT
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import move_rows
+from gsparc.prediction.pareto import defined_figure
 from gsparc.prediction.timing import (
     ClockSettings,
     cycle_queries,
@@ -175,7 +176,7 @@ class Study:
     ) -> None:
         """One training per condition that changes what is learned from, scored under all of them."""
         # Each round has another seed, of the draws of errors as well as of the method.
-        seed, figure, facts = self.seed + turn, DECIDING[data.site.scored], dict[str, Any]()
+        seed, figure, facts = self.seed + turn, "", dict[str, Any]()
         fits: dict[Condition, FoldFits] = {}
         for condition in self.conditions:
             learned = condition.learned
@@ -192,10 +193,12 @@ class Study:
             outcome = fits[learned]
             if condition.what == "query":
                 outcome = outcome.with_scores(condition.tested_on(data, split, seed), split)
+            # Where rows were silent they count, as in every other table.
+            figure = WITH_SILENT if WITH_SILENT in outcome.figures else DECIDING[data.site.scored]
             folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
-                "value": _value(outcome, figure), "train_s": float(np.mean(outcome.train_s)),
+                "value": defined_figure(outcome.figures, figure), "train_s": float(np.mean(outcome.train_s)),
                 "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
                 "effects": str(outcome.methods[0].effects or "none"),
             }  # fmt: skip
@@ -222,13 +225,6 @@ class Study:
         times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [median_and_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
-
-
-def _value(outcome: FoldFits, figure: str) -> float:
-    value = outcome.figures[figure]
-    if value is None:
-        raise ValueError(f"{figure} is not defined on these test rows")
-    return value
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,17 +13,21 @@ import pandas as pd
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
-from gsparc.evaluation.metric_formats import CALIBRATION, DECIDING, WITH_SILENT, form_of, heading_of
+from gsparc.evaluation.metric_formats import (
+    CALIBRATION,
+    DECIDING,
+    WITH_SILENT,
+    form_of,
+    heading_of,
+    lower_is_better,
+    score_heading,
+)
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import BUSY
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
+from gsparc.evaluation.summary import busy_machine, wrong_deviations
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Table, value_with_error
 
 SECOND: dict[Scored, str] = {
     "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
-}  # fmt: skip
-SCORE = {
-    "psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "nmse_aligned": "-10 log10 NMSE, dB",
-    "rmse_db": "-RMSE dB",
 }  # fmt: skip
 # Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
@@ -160,7 +165,8 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     """Return what the table shows about simple baselines and about our own default, favourable or not."""
     rows = list(block.itertuples())
     first = rows[0]
-    lines = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
+    level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
+    lines = [f"first: {first.method}, {level} after {first.train_s:.3g} s of training"]
     own = next((row for row in rows if row.method == ours), None)
     if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
@@ -183,29 +189,21 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
+    lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:
         lines.append(f"measured with another program (at commit): {old}")
-    load = block.load[block.budget_s.notna()].max()
-    if load > BUSY:
-        lines.append(
-            f"the machine was busy (load up to {load:.1f} per core): train s/fold is inflated, "
-            "cpu s/fold is what was spent"
-        )
-    return lines
+    return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
     """Return a block as a table, the row of `ours` bold, without columns that no row fills."""
-    figure, draws, score = block.figure.iloc[0], block.draws.any(), value_with_error("score_db", "spread_db")
-    # Of the others it is the score but for its sign.
-    valued = figure.startswith("nmse") or (figure == "rmse_db" and not draws)
-    value = value_with_error("value", "value_error")
+    figure, draws, value = block.figure.iloc[0], block.draws.any(), value_with_error("value", "value_error")
     columns = [
         (True, Column("method", "", of=lambda row: row["method"] + row["label"])),
-        (True, Column(SCORE[figure], ".2f", of=score)),
+        (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
-        (valued, Column(figure, ".3g" if draws else ".4g", of=value)),
+        (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second.iloc[0], of="second_value")),
         *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
         (not draws, Column("seeds", "d", of="seeds")),
@@ -215,6 +213,15 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
     bold = {"bold": str((own.method + own.label).iloc[0])} if len(own) else {}
     shown = [column for there, column in columns if there]
     return Table.of(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
+
+
+def shown(figure: str, score_db: float) -> float:
+    """Return a score as a reader knows it: of figures of which less is better, without its turned sign."""
+    return -score_db if lower_is_better(figure) else score_db
+
+
+def _score(row: Mapping[str, Any]) -> Interval:
+    return Interval(shown(row["figure"], row["score_db"]), error=row["spread_db"])
 
 
 def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:

@@ -66,7 +66,7 @@ def measure_candidates(
         whole = answers if whole is None else whole
         scored.append((there.figures(), closeness_db(answers, whole)))
         if number % 10 == 9:
-            log.info("%d of %d combinations scored", number + 1, len(candidates))
+            log.info("%d of %d faster variants scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
     for index, (_, method) in enumerate(candidates):
         ask = Predictor(method, data.site).cycling(places)
@@ -118,13 +118,9 @@ def beaten_by(point: Point, others: Mapping[str, Point], figure_name: str) -> st
 
 
 def draw_front(
-    points: Sequence[Point],
-    on_front: Sequence[int],
-    others: Mapping[str, Point],
-    figure_name: str,
-    method: str,
-    title: str,
-) -> Figure:
+    points: Sequence[Point], on_front: Sequence[int], others: Mapping[str, Point], figure_name: str,
+    method: str, title: str,
+) -> Figure:  # fmt: skip
     """Draw the points of a method beside others by name; `on_front` are of the front, fastest first."""
     lines = 0.16 * (len(on_front) + 1)  # inches of the legend
     figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))

@@ -19,7 +19,7 @@ from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
+from gsparc.evaluation.summary import better_baseline, busy_machine, run_conditions
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -90,10 +90,7 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     if scored:  # a baseline must beat the best run of the page
         remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
-    if loads and max(loads) > BUSY:
-        ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))
-        remarks.append(f"the machine was busy (load {ends} per core): times are inflated, ratios less so")
-    return list(dict.fromkeys(remarks))
+    return list(dict.fromkeys(remarks + busy_machine(loads)))
 
 
 def _unique_ids(svg: str, number: int) -> str:

@@ -72,6 +72,11 @@ def accuracy_column(figure: str, note: str = "") -> Column:
     return Column(heading_of(figure), form_of(figure), note, partial(interval_of_figure, figure=figure))
 
 
+def _figures(row: Row) -> list[str]:
+    """Figures of its data, first the one that decides: with silent rows it is none of the usual ones."""
+    return list(dict.fromkeys([row["figure"], *TABLES[row["kind"]]]))
+
+
 def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs that differ by their seed only, by setting, in order of appearance."""
     groups: dict[str, list[Run]] = {}
@@ -84,7 +89,7 @@ def table_of_results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        SETTING, SEED, *(accuracy_column(f, note) for f in TABLES[runs[0].row["kind"]]),
+        SETTING, SEED, *(accuracy_column(f, note) for f in _figures(runs[0].row)),
         Column(heading_of(CALIBRATION), form_of(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
@@ -118,7 +123,7 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
 
 
 def _spread_columns(runs: Sequence[Run]) -> list[Column]:
-    figures = [Column(heading_of(f), form_of(f), of=f) for f in TABLES[runs[0].row["kind"]]]
+    figures = [Column(heading_of(f), form_of(f), of=f) for f in _figures(runs[0].row)]
     if any(run.row["alone"] is not None for run in runs):
         deciding = runs[0].row["figure"]
         figures.append(Column(f"{heading_of(deciding)} of Gaussians alone", form_of(deciding), of="alone"))

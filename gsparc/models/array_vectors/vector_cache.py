@@ -29,6 +29,9 @@ def _kept(key: str) -> dict[int, tuple[Any, ...]]:
     return {}
 
 
+forget_vectors = _kept.cache_clear  # before what is to pay for its own work
+
+
 def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
     """Return array vectors of the given rows, and the seconds they took when computed.
 
@@ -72,6 +75,6 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
     if len(bad):
         more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         log.warning(
-            "%d spectra do not fit this array (see %s): %s%s",
+            "%d spectra are none that this array can make (array_position? a fault? see %s): %s%s",
             len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip

@@ -149,7 +149,7 @@ class ImageSourceGP(SourcesInFrame):
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
-        ended = "noise floor reached" if agree else "all counted"
+        ended = "two agree up to noise, enough" if agree else "all that effort= asks for"
         ended = "ended by the time budget" if budget.limited else ended
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
         notes = [f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources"]

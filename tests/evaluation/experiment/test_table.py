@@ -101,7 +101,7 @@ def test_losers_are_not_hidden():
     assert "never run was not run: no verdict" in absent and "baseline wins" not in absent
     assert "gsparc is 0.50 dB behind gp, within the seeds' spread" in said
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
-    assert "busy (load up to 3.0 per core)" in said
+    assert "busy (load 0.1 to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
     said = " | ".join(remarks(split_by_problem(average_cells(far, {}))[0], "gsparc"))
     assert "2.00 dB behind gp" in said and "spread" not in said
@@ -139,3 +139,13 @@ def test_lists_were_compared_by_their_listed_rows_alone():
     (block,) = split_by_problem(average_cells(found, {}))
     first = next(block.itertuples())
     assert (first.method, first.figure, first.second) == ("gsparc", "rmse_db_with_silent", "rmse_db")
+
+
+def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
+    """Its figure had no heading; that of errors was `-RMSE dB`, with negative numbers."""
+    facts = {"test/rmse_db_with_silent": 4.2, "test/reduced_chi2": 25.0}
+    found = average_cells([filled("gp", 5.0, 0, 9.0, kind="rssi", **facts)], {})
+    page = markdown(split_by_problem(found), "gsparc")
+    assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
+    assert "std of gp is 5 times too small" in page and "gsparc map" in page
+    draw_budgets(found, tmp_path / "compare.png", "gsparc")

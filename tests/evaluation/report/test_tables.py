@@ -113,3 +113,12 @@ def test_settings_of_several_models_were_told_for_each(tmp_path):
     ]
     told = "".join(tables.differing_settings(runs).values())
     assert "init.count=1" in told and "model.x" not in told and "model._target_" not in told
+
+
+def test_a_report_of_lists_left_out_the_figure_that_decides(tmp_path):
+    """Beside its table of listed rows a remark named the better baseline by all rows."""
+    figures = {"rmse_db": 4.6, "mae_db": 3.0, "rmse_db_with_silent": 2.2}
+    run = Run(tmp_path, {"dataset/kind": "rssi", **{f"test/{name}": v for name, v in figures.items()}})
+    shown = cells(tables.table_of_results([run]), 0)
+    assert list(shown)[2:5] == ["RMSE dB, silent too", "RMSE dB", "MAE dB"]
+    assert shown["RMSE dB, silent too"].value == 2.2

@@ -148,7 +148,7 @@ def learn_network(
         f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: exponent "
         f"{exponent:.3g}, levels +- {gain:.2g} dB, shadowing of a site {site:.2g} dB over"
         f" {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m and"
-        f" {bearing:.2g} dB by bearing, noise {noise:.2g} dB"
+        f" {bearing:.2g} dB by direction from it, noise {noise:.2g} dB"
     )
     beams = (
         f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as said, floor "
