@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from releases import real
 
-from gsparc.data.own import interpret
 from gsparc.data.query import Query
-from gsparc.data.raw import read_raw
-from gsparc.data.selection import Selection
-from gsparc.data.splits import SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.reduced import reduce_method
@@ -22,7 +17,6 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
-from gsparc.training.context import FitContext
 from tests.models.powers.test_settings import error_db, fit, town
 
 KERNEL = Kernel.matern((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
@@ -197,20 +191,6 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     assert torch.allclose(near.mean_at(batch), said.mean)
     lean = reduce_method(near, {"confidence": False}, {}).predict(batch)
     assert lean.variance is None and torch.allclose(lean.mean, said.mean)
-
-
-@pytest.mark.slow
-def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
-    """Squares of 0.6 m of the plane: a length of 1.8 m, an amplitude of 3e5 dB^2 and errors of 30 dB."""
-    path = real("real/techtile-power-reci-rf-1.npz")
-    data = interpret(read_raw(path), path, Selection(min_rssi_db=-75)).data
-    split = SplitSettings(name="blocks", side_m=0.6, seed=9)
-    fold = make_split(data.moving, split, place=data.place).folds[0]
-    method = GaussianProcess()
-    method.fit(data, fold, FitContext())
-    batch = data.batch(fold.test)
-    error = (method.predict(batch).mean / batch.target).clamp_min(1e-30).log10() * 10
-    assert error.square().mean().sqrt() < 6.0
 
 
 def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
-from torch.utils.benchmark import Timer
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
@@ -144,27 +143,6 @@ def test_it_beats_neighbours(known_campaign, small, tmp_path):
     assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
 
 
-def test_confidence_falls_and_error_grows_with_distance(known_campaign, small):
-    data, method = known_campaign[0], small[0]
-    batch = data.batch(np.array([40]))
-    away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
-    found = method.predict(Query(batch.tx + away, batch.rx))
-    assert (found.confidence.diff() < 0).all() and (found.variance.diff() > 0).all()
-    assert found.confidence[-1] == 0 and found.mean.min() >= 0 and found.mean.max() <= 1
-    background = method.fitted().response.background
-    torch.testing.assert_close(found.mean[-1], background, atol=1e-3, rtol=0)
-
-
-def test_position_errors_cost_smoothly(known_campaign, small):
-    """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
-    data, method = known_campaign[0], small[0]
-    batch = data.batch(np.arange(0, 160, 8))
-    still = method.predict(batch).mean
-    moved = [method.predict(Query(batch.tx + shift, batch.rx)).mean for shift in (0.001, 0.01, 0.1)]
-    error = [float((m - still).square().mean().sqrt()) for m in moved]
-    assert error[0] < 0.02 and error[0] < error[1] < error[2]
-
-
 def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, small, tmp_path, monkeypatch):
     data, whole, few = known_campaign[0], small[0], ArrayField(SMALL)
     few.settings = replace(
@@ -224,13 +202,3 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
         ]
     assert ahead["random"][0] > 0 and ahead["random"][1] > 0
     assert ahead["grouped"][0] > 0.02 and ahead["grouped"][1] > 0.5
-
-
-@pytest.mark.slow
-def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
-    data = load({"name": "rfid", "root": str(real_rfid)})
-    method = ArrayField()
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
-    batch = data.batch(np.array([0]))
-    timer = Timer("method.predict(batch)", globals={"method": method, "batch": batch})
-    assert timer.blocked_autorange(min_run_time=0.3).median < 1e-3

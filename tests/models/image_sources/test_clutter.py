@@ -111,18 +111,6 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
 
 
-def test_concatenated_scenes_do_not_interact():
-    planes, clutter = _table()
-    places = _rows(15).position
-    one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
-    two = _scene(_boxed(_box()))
-    members = [Posterior(_rows(3), phased(each, torch.zeros(len(each.sequences)))) for each in (one, two)]
-    together = EnsembleMeans(members).visible_share(places)
-    torch.testing.assert_close(
-        together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
-    )
-
-
 def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
     scenes = [_scene(_boxed(_box())), _scene(Clutter.none())]

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gains import fitted, gains
+from gains import fitted
 from invented import invent
-from rooms import WAVELENGTH, furnished, nmse, shoebox
+from rooms import WAVELENGTH, nmse, shoebox
 from scenes import error
 from shoeboxes import as_arrays
 
@@ -105,28 +105,6 @@ def test_without_a_query_there_was_an_error(small):
     assert _predicted(method, data, np.zeros(0, np.int64)).mean.shape == (0, 1, 1)
 
 
-def test_one_query_is_like_many(small):
-    _, data, fold, method, _ = small
-    many = _predicted(method, data, fold.test[:5])
-    for i, row in enumerate(fold.test[:5]):
-        torch.testing.assert_close(
-            _predicted(method, data, np.array([row])).mean[0], many.mean[i], rtol=1e-3, atol=1e-4
-        )
-
-
-def test_a_small_budget_ends_after_the_first_search(tmp_path):
-    _, data, fold = shoebox(80, size=(3.0, 2.5, 2.2), max_order=0)
-    method = ImageSourceGP(searches=3, search_rows=80, margin=1.0)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # two may start two searches before any time is over
-    try:
-        report = method.fit(data, fold, FitContext(tmp_path, budget_s=0.01))
-    finally:
-        torch.set_num_threads(threads)
-    assert len(method.members) == 1
-    assert "1 of 3 searches (ended by the time budget)" in report.notes[0]
-
-
 def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, monkeypatch):
     monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
     monkeypatch.setattr(race, "STALLED", -math.inf)
@@ -210,44 +188,6 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
     method = ImageSourceGP(searches=1)
     method.fit(data, fold, FitContext(tmp_path))
     assert found_share(method, told) >= 0.9 and error(method, data, fold.test) <= 0.01
-
-
-@pytest.mark.slow
-def test_visibility_behind_a_pillar_is_learned(tmp_path):
-    told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1, pillar=True)
-    method = ImageSourceGP(searches=1)
-    method.fit(data, fold, FitContext(tmp_path))
-    assert error(method, data, fold.test) <= 0.02
-    learned, true = learned_and_true_visibility(method, told, data, fold.test)
-    assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.9
-
-
-@pytest.mark.slow
-@pytest.mark.rare
-def test_a_furnished_room(tmp_path):
-    told, data, fold = furnished(450)
-    method = ImageSourceGP(searches=1)
-    method.fit(data, fold, FitContext(tmp_path, budget_s=400))  # of which a quiet machine needs a fraction
-    # The farthest wall may stay a wavelength off: a phase of its own makes up for it.
-    assert found_share(method, told, within=0.5, order=1) >= 6 / 7
-    assert found_share(method, told, within=1.5, order=1) == 1.0 and error(method, data, fold.test) <= 0.02
-
-
-def learned_and_true_visibility(method, told, data, index, most=6):
-    """Of the strongest true sources that were found: (n, K) learned, (n, K) true."""
-    member = method.members[0]
-    places = torch.from_numpy(data.moving[index]) - method.frame.middle
-    learned_gains = gains(member, places).abs()[:, :, 0].numpy() * method.frame.scale * data.site.target_scale
-    sources = (member.scene.sources + method.frame.middle).numpy() + data.site.origin
-    true = told.images.of(told.tx[0])
-    learned, seen = [], []
-    for i in np.argsort(told.images.order):
-        distance = np.linalg.norm(sources - true[i], axis=-1)
-        if distance.min() < 0.5 * WAVELENGTH and len(learned) < most:
-            full = abs(told.images.gain[i]) * WAVELENGTH / (4 * np.pi)
-            learned.append(learned_gains[:, distance.argmin()] / full)
-            seen.append(told.visible[index, i])
-    return np.stack(learned, 1), np.stack(seen, 1)
 
 
 @pytest.mark.slow

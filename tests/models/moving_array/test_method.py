@@ -20,7 +20,6 @@ from gsparc.simulate.shoebox import mirror_images
 from gsparc.training.context import FitContext
 
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
-QUICK = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
 
 
 @pytest.fixture(scope="module")
@@ -89,13 +88,6 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     here, there = fitted.predict(near), fitted.predict(Query(near.tx, far))
     assert (here.confidence > there.confidence).all() and (here.variance < there.variance).all()
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
-
-
-def test_a_search_ends_when_the_seconds_are_over(data, fold, tmp_path):
-    """The clock that ended it was not reported."""
-    method = MovingArrayField(search=QUICK, components=16)
-    report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3, budget_clock="processor"))
-    assert report.limited_by == "processor" and not method.resumable
 
 
 def test_powers_are_the_best_that_are_not_negative():

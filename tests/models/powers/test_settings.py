@@ -129,21 +129,6 @@ def test_five_thousand_rows(make):
     assert error_db(method, batch) < 4.0
 
 
-@pytest.mark.skipif(not CITY.is_file(), reason="measured city powers are not beside this checkout")
-def test_a_measured_station():
-    """One station: the mean misses by 9 dB, all 3,300 rows by 4 dB."""
-    with np.load(CITY) as stored:
-        heard = np.flatnonzero(np.isfinite(stored["rssi_db"][:, 11]))
-        chosen = np.random.default_rng(0).permutation(heard)[:700]
-        places = np.pad(stored["mobile_position"][chosen], ((0, 0), (0, 1)))
-        station = np.append(stored["station_position"][11], 0.0)
-        decibels = stored["rssi_db"][chosen, 11].astype(float)
-    data = from_arrays({"tx_position": places, "rx_position": station, "rssi_db": decibels}, {"name": "city"})
-    method = GaussianProcess()
-    batch, _ = fit(method, data, 500)
-    assert error_db(method, batch) < 5.0
-
-
 def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
     """The share of the prior's variance was 0.03 a kilometre away: that of the law grows without end."""
     data = town(160, shadowing_db=0.5)

@@ -77,18 +77,6 @@ def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
     assert np.allclose(answer / scale, said.mean[0], atol=1e-3 * float(said.mean.abs().max()))
 
 
-def test_a_loaded_field_predicts_new_poses(tmp_path):
-    """The receiver moves and turns: turning it about its boresight rolls the image."""
-    method, data, _ = fitted(spectra(tmp_path / "own.npz", moving="rx"), tmp_path)
-    where = torch.tensor([[0.1, 0.2, -0.1]])
-    quarter = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
-    still = torch.from_numpy(data.tx[:1]).float()
-    straight = method.predict(Query(still, Pose.identity(where))).mean
-    turned = method.predict(Query(still, Pose(where, quarter))).mean
-    assert torch.allclose(turned.roll(8, -1), straight, atol=1e-3)
-    assert (turned - straight).abs().max() > 0.05
-
-
 def test_many_queries_are_answered_in_chunks(tmp_path):
     for moving in ("tx", "rx"):
         folder = tmp_path / moving

@@ -24,7 +24,6 @@ from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
-from gsparc.processes.stored import restored, stored
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -153,13 +152,6 @@ def places(number: int, *bearings: float) -> torch.Tensor:
     return torch.from_numpy(np.c_[at, np.zeros((len(turn), 3)), np.full(len(turn), number)])
 
 
-def test_the_pattern_of_a_sector():
-    trend = sectors()
-    ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
-    assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
-    assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
-
-
 def shadowing() -> Kernel:
     return Kernel((SectorShadowing((50.0, 50.0), (0.5, 0.2, 0.2, 0.1)), WhiteNoise(0.1)), 20.0)
 
@@ -198,15 +190,3 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
     around = Pose(places(0, 0, 90, 180, 270)[:, :3] + 3000, torch.eye(3).expand(4, 3, 3).double())
     said = field.predict(Query(torch.full((4, 3), 3000.0).double(), around)).mean.log10()
     assert float(said.max() - said.min()) < 1e-6
-
-
-def test_sectors_of_a_site_share_shadowing():
-    kernel = shadowing()
-    here, there = places(0, 10.0), places(1, 10.0)
-    assert float(kernel.between(here, here)) == pytest.approx(1.0)
-    assert float(kernel.between(here, there)) == pytest.approx(0.5)
-    both = torch.cat([here, there, places(0, 200.0)])
-    assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    for again in (restored(stored(kernel)), kernel.at(kernel.parameters())):
-        assert torch.allclose(again.gram(both), kernel.gram(both))
-        assert again.amplitude == 20
