@@ -32,14 +32,6 @@ def test_every_gaussian_has_a_network_of_its_own(hidden):
         assert torch.allclose(many.logits(where)[:, i], want, atol=1e-6)
 
 
-def test_one_gaussian_does_not_see_the_weights_of_another():
-    many = emission()
-    many.logits(torch.rand(3, 3))[:, 2].sum().backward()
-    for parameter in many.parameters():
-        others = [0, 1, 3, 4]
-        assert parameter.grad[2].any() and (parameter.grad[others] == 0).all()
-
-
 def test_activations():
     where, apart = torch.rand(2, 3), torch.full((2, 5), 3.0)
     plain = emission(activation="linear")
