@@ -184,6 +184,13 @@ def test_a_channel_restores_a_missed_ray():
     assert not bool(quiet[rays == 0].any())
 
 
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+def test_where_every_ray_was_wrong_the_odds_divided_by_zero(seen):
+    """One channel of 80 dB too much hides all sources from all receivers: a share of one has no odds."""
+    rays, truth = torch.full((4, 2), 1 - seen), torch.full((4, 2), seen)
+    assert torch.isfinite(RayErrorRates.of(rays, truth).odds(rays, 0.5 * torch.ones(4, 2))).all()
+
+
 def _random_rays(data):
     rays = np.random.default_rng(0).normal(size=(len(data.directions), 5, 3)).astype(np.float32)
     return replace(data, directions=list(rays / np.linalg.norm(rays, axis=-1, keepdims=True)))
