@@ -269,24 +269,6 @@ def test_without_the_residual_gaussians_are_alone(name):
     torch.testing.assert_close(found.mean, found.explained)
 
 
-@pytest.mark.parametrize(
-    "name,override,said",
-    [
-        ("images", "array=true", "the dataset declares no array or no carrier"),
-        ("static array", "moving_array=true", "the receiver stands still"),
-        ("moving array", "array=true", "the receiver moves"),
-        ("channels from nowhere known", "phase=true", "does not say where the static end is"),
-        ("channels", "power=true", "the target is csi"),
-        ("powers", "phase=true", "the target is rssi, which carries no phase"),
-    ],
-)
-def test_a_term_that_means_nothing_here_is_refused_in_a_line(name, override, said):
-    with pytest.raises(ValueError, match=said) as raised:
-        fit(name, f"model.effects.{override}")
-    text = str(raised.value)
-    assert text.startswith(f"model.effects.{override} is not possible: ") and "\n" not in text
-
-
 def test_stations_have_fields_of_their_own_and_share_the_seconds():
     fitted = fit("powers of several stations", stations="each")
     assert isinstance(fitted.method, PerStation) and fitted.method.effects == "residual"

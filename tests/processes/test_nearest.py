@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.query import Query
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.reduced import reduce_method
 from gsparc.processes import neighbourhood, powers
 from gsparc.processes.kernel import Kernel, SmoothRough
@@ -105,29 +103,6 @@ def test_silent_rows_stay_known_and_are_counted(many):
     assert heard < unheard
 
 
-def test_back_from_disk(many, tmp_path):
-    data, method = town(160), GaussianProcess()
-    batch, _ = fit(method, data, 140)
-    torch.save(method.state(), tmp_path / "state.pt")
-    again = GaussianProcess()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    said, then = method.predict(batch), again.predict(batch)
-    for part in ("mean", "confidence", "variance"):
-        assert torch.equal(getattr(said, part), getattr(then, part))
-    assert again.label == "gp (Vecchia 30)"
-
-
-def test_slopes_of_the_mean():
-    data = town(120)
-    rows = rows_of(data, 120)
-    near = given(rows)
-    at = torch.from_numpy(data.moving[:5] + 1.0).requires_grad_()
-    (slope,) = torch.autograd.grad(near.mean_at(at).sum(), at)
-    for axis in torch.eye(3, dtype=torch.float64)[:2]:
-        ends = [near.mean_at((at + h * axis).detach()) for h in (1e-4, -1e-4)]
-        assert torch.allclose(slope @ axis, (ends[0] - ends[1]) / 2e-4, rtol=1e-4, atol=1e-7)
-
-
 def test_left_out_is_a_prediction_without_each_place():
     data = town(50)
     rows = rows_of(data, 50)
@@ -160,15 +135,6 @@ def test_a_parked_car_counts_no_more_than_a_street():
     assert (chosen >= 9000).mean() > 0.75
     assert np.array_equal(covering_rows(places[:300], 500, 0), np.arange(300))
     assert len(covering_rows(np.zeros((50, 3)), 20, 0)) == 20
-
-
-def test_kriging_of_many_places_says_how_many(monkeypatch):
-    monkeypatch.setattr("gsparc.models.baselines.kriging.WHOLE", 150)
-    data, method = town(700), Kriging()
-    batch, _ = fit(method, data, 400)
-    assert method.label == "kriging (nearest 100)" and Kriging().label == "kriging"
-    one = [method.predict(Query(batch.tx[i : i + 1], batch.rx[i : i + 1])).mean for i in range(300)]
-    assert torch.allclose(method.predict(batch).mean, torch.cat(one))
 
 
 @pytest.mark.parametrize("kind", ["csi", "spectrum"])

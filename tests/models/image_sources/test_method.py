@@ -21,6 +21,7 @@ from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import draw_rows
 from gsparc.models.mixture.methods import ImageSources
+from gsparc.physics.mirror_planes import reflect
 from gsparc.prediction.predictor import Predictor
 from gsparc.training import race
 from gsparc.training.context import FitContext
@@ -97,6 +98,16 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     assert found.direction.shape[1] == found.gain.shape[2] == found.delay_s.shape[2] == method.size()
     summed = found.channel(data.site.subcarriers_hz)
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
+
+
+def test_objects_mirror_the_transmitter_into_its_images(small):
+    method = small[3]
+    scene, planes = method.members[0].scene, torch.from_numpy(method.objects().planes)
+    torch.testing.assert_close(planes[:, :3].norm(dim=1), torch.ones(len(planes)).double())
+    end = scene.transmitter + method.frame.middle
+    for sequence, place in zip(scene.sequences, scene.sources, strict=True):
+        if len(sequence) == 1:
+            assert torch.allclose(reflect(end, planes[sequence[0]]), place + method.frame.middle, atol=1e-6)
 
 
 def test_without_a_query_there_was_an_error(small):
@@ -207,3 +218,27 @@ def test_scatterers_are_found_beside_images(tmp_path):
     for wanted, within in ((true, 0.1), (images, 0.3)):
         assert (np.linalg.norm(wanted[:, None] - places[None], axis=-1).min(1) < within * WAVELENGTH).all()
     assert error(method, data, fold.test) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offsets", ["none", "phase", "phase_timing"])
+def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, tmp_path):
+    """After one free complex number per sample: unseen snapshots have unknown phases too."""
+    rng, tones = np.random.default_rng(0), 2.4e9 + np.arange(16) * 5e6
+    _, data, fold = shoebox(150, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=tones, reflection=-0.5)
+    delay = rng.uniform(-20e-9, 20e-9, (150, 1)) * (offsets == "phase_timing")
+    turn = rng.uniform(-np.pi, np.pi, (150, 1)) - 2 * np.pi * delay * (tones - data.site.carrier_hz)
+    seen = replace(data, target=(data.target * np.exp(1j * turn)[:, None]).astype(np.complex64))
+    method, _ = fitted(seen, fold, tmp_path, search_rows=300, offsets=offsets)
+    batch = data.batch(fold.test)
+    found, true = method.predict(batch).mean.numpy(), batch.target.numpy()
+    scalar = (found.conj() * true).sum((1, 2)) / (np.abs(found) ** 2).sum((1, 2))
+    if offsets == "none":
+        assert nmse(found, true) > 0.5
+    else:
+        assert nmse(found * scalar[:, None, None], true) < 0.01
+
+
+def test_unknown_kind_of_offset_is_refused():
+    with pytest.raises(ValueError, match="phase_timing"):
+        ImageSourceGP(offsets="both")
