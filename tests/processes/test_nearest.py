@@ -73,14 +73,14 @@ def test_rows_of_one_place_are_its_mean_and_lose_nothing():
 
 
 def test_thirty_neighbours_tell_nearly_all_and_the_label_says_so(many):
-    data = town(700)
+    data = town(450)
     near, whole = GaussianProcess(), GaussianProcess()
-    batch, notes = fit(near, data, 500)
+    batch, notes = fit(near, data, 300)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(powers, "MOST_ROWS", 10_000)
-        fit(whole, data, 500)
+        fit(whole, data, 300)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
-    assert "gp: each place is predicted from the 30 nearest of 500 (Vecchia)" in notes
+    assert "gp: each place is predicted from the 30 nearest of 300 (Vecchia)" in notes
     assert error_db(near, batch) < 1.03 * error_db(whole, batch)
 
 
