@@ -10,9 +10,10 @@ from rooms import WAVELENGTH, shoebox
 from scenes import answer_error
 
 from gsparc.data.own import from_arrays
+from gsparc.data.schema import Stations
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
-from gsparc.models.channels.columns import SlotPlaces, coherent_bands, group_channels
+from gsparc.models.channels.columns import NOBODY, SlotPlaces, coherent_bands, group_channels, query_ends
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
@@ -25,6 +26,7 @@ from gsparc.models.channels.kernels import (
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isotropic, Leakage, Noise
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
+from gsparc.ops import Pose
 from gsparc.processes.left_out import rows_of_groups
 from gsparc.training.context import FitContext
 
@@ -298,3 +300,11 @@ def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
         ChannelField().predict(batch)
     with pytest.raises(ValueError, match="known carrier"):
         fitted_to(ChannelField(PLAIN), replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30))
+
+
+def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
+    here = np.array([[1.0, 2, 3], [np.nan] * 3])
+    site = replace(campaign("csi", 8, "tx").site, stations=Stations(here, ("known", "unknown")))
+    asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
+    *_, nearest = query_ends(site, asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
+    assert nearest.tolist() == [1, 0, NOBODY]

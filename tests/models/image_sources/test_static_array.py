@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gains import fitted, phased
+from rooms import shoebox
 from scenes import error, fold_of
 
 from gsparc.data.own import from_arrays
@@ -173,26 +174,9 @@ def test_antennas_of_unknown_places_are_outputs_of_their_own():
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
 
 
-def _ofdm(count, noise):
-    """Receivers with 4 antennas and 52 tones at 5.18 GHz in a room, hardly any noise."""
-    rng = np.random.default_rng(1)
-    places = rng.uniform([0.2, 0.2, 0.5], [2.8, 2.3, 1.5], (count, 3))
-    tones = 5.18e9 + 312500.0 * np.arange(-26, 26)
-    array = np.c_[np.zeros(4), (np.arange(4) - 1.5) * LIGHT / 5.18e9 / 2, np.zeros(4)]
-    channels = np.stack([_channels(p + array, CENTRE[None], tones)[:, 0] for p in places])
-    shape, power = channels.shape, noise * (np.abs(channels) ** 2).mean()
-    channels = channels + np.sqrt(power / 2) * (rng.standard_normal((*shape, 2)) @ [1, 1j])
-    data = from_arrays(
-        {
-            "tx_position": CENTRE, "rx_position": places, "array_position": array, "csi": channels,
-            "frequency_hz": tones,
-        }
-    )  # fmt: skip
-    return data, fold_of(data)
-
-
 def test_rows_draw_antennas_so_that_places_are_many():
-    data, fold = _ofdm(60, 1e-3)
+    tones, array = CARRIER + 1e6 * np.arange(8), np.eye(4, 3) / 30
+    _, data, fold = shoebox(60, max_order=0, frequency_hz=tones, array=array)
     rows = draw_rows(data, fold.train, 2 * len(fold.train), 0)
     assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
 

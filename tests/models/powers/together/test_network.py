@@ -94,25 +94,6 @@ def test_sites_without_azimuths_have_no_pattern(tmp_path):
     assert not any("beams" in note for note in report.notes)
 
 
-RARE = pytest.mark.rare
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=RARE), 1, pytest.param(2, marks=RARE)])
-@pytest.mark.parametrize("count", [pytest.param(3, marks=RARE), 6, pytest.param(10, marks=RARE)])
-@pytest.mark.parametrize(("azimuths", "wrong"), [(True, 0), (True, 2), (False, 0)])
-def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
-    one = network(seed, wrong)
-    method, _ = fitted(one, count, tmp_path, azimuths)
-    found, plain = (
-        judged(one, count, *levels(method, one)),
-        judged(one, count, *reference(one, count, azimuths)),
-    )
-    assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
-    assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), found
-    assert found["best"] > plain["best"] - 0.05, (found, plain)
-
-
 def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
