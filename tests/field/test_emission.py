@@ -70,8 +70,3 @@ def test_inverse_of_impossible_powers_is_finite(activation):
     assert torch.isfinite(
         many.inverse(torch.tensor([[[-3.0], [0.0], [1.0], [40.0], [1e-9]]]), torch.ones(1, 5))
     ).all()
-
-
-def test_no_gaussians_emit_nothing():
-    for hidden in (0, 4):
-        assert emission(hidden, count=0)(torch.rand(3, 3), torch.ones(3, 0)).shape == (3, 0, 2)
