@@ -14,11 +14,9 @@ from gsparc.data.load import load, split_for
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.evaluation.scores import score_methods
-from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models.array_vectors import splat_init
-from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_gp import (
     align_by_likelihood,
     mirror_elements,
@@ -111,19 +109,6 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
     assert unknown[0, 0] == pytest.approx(1 - weights @ cross[:, 0], rel=1e-6)
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
-
-
-def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
-    data, truth = known_campaign
-    images = data.target.reshape(160, -1).astype(np.float32) / 255
-    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()
-    scaled = truth / np.abs(truth @ matrix.conj()).max(1, keepdims=True)
-    chosen = choose_kernel(
-        scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array)
-    )
-    a, b = fit_error_law(chosen.unknown, chosen.error)
-    assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
-    assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
 
 
 def test_fit_without_a_run_folder_writes_nothing(known_campaign, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from closed import conditioned, fitted_to, read_back
+from closed import conditioned, fitted_to
 from rooms import WAVELENGTH, shoebox
 from scenes import answer_error
 
@@ -284,22 +284,6 @@ def test_tones_far_apart_are_bands_of_their_own():
     found = coherent_bands(tones, 10.0)
     assert len(coherent_bands(tones, 0.1)) == 1 and len(found) > 4
     assert sorted(sum(found, ())) == list(range(40))
-
-
-def test_a_restored_field_answers_the_same_and_a_fresh_one_is_refused(tmp_path):
-    data = _sent(60)
-    field = _whole(data, correlated=True)
-    again = read_back(field)
-    batch = data.batch(np.arange(40, 60))
-    with torch.no_grad():
-        before, after = field.predict(batch), again.predict(batch)
-    for name in ("mean", "variance", "explained", "unknown"):
-        torch.testing.assert_close(getattr(after, name), getattr(before, name))
-    assert again.terms == field.terms
-    with pytest.raises(ValueError, match="not conditioned"):
-        ChannelField().predict(batch)
-    with pytest.raises(ValueError, match="known carrier"):
-        fitted_to(ChannelField(PLAIN), replace(data, site=replace(data.site, carrier_hz=None)), np.arange(30))
 
 
 def test_the_one_station_at_an_unknown_place_was_nobody(campaign):

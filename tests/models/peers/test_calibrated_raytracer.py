@@ -128,13 +128,6 @@ def test_gradients_are_the_powers_own(wall):
 
 
 @pytest.mark.slow
-def test_a_replay_is_the_trace(wall):
-    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
-    traced = wall.trace(places(), PLAIN).received_power()
-    np.testing.assert_allclose(Replay(wall, places(), PLAIN).powers(), traced, rtol=1e-4)
-
-
-@pytest.mark.slow
 def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
     apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
     power = wall.trace(places(), PLAIN).received_power() * 10 ** (GAIN_DB / 10)

@@ -102,14 +102,6 @@ def test_left_out_rows_are_predicted_without_them():
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
 
-def test_what_cannot_be_is_refused():
-    data = town(20)
-    with pytest.raises(ValueError, match="at least one row"):
-        fitted_to(PowerField(), data, np.arange(0))
-    with pytest.raises(ValueError, match="condition it first"):
-        small_field(data).left_out()
-
-
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
     """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
     chosen = [FitContext(effort=effort, budget_s=1e-9).time_budget() for effort in (1e-3, 1.0, 8.0)]

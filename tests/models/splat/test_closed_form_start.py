@@ -65,11 +65,6 @@ def test_the_start_explains_training_and_unseen_rows(smooth, on):
     assert error(model, smooth, np.arange(40, 48)) < 0.5 * spread(smooth)
 
 
-def test_more_gaussians_explain_more(smooth):
-    errors = [error(started(smooth, count=n), smooth, ROWS) for n in (5, 40, 300)]
-    assert errors[0] > errors[1] > errors[2]
-
-
 def test_a_network_with_hidden_units_has_no_closed_form(smooth):
     with pytest.raises(ValueError, match=r"or model\.emission\.hidden=0"):
         started(smooth, emission=dataclasses.replace(KERNEL, hidden=4))

@@ -13,8 +13,6 @@ from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.known import images as known
 from gsparc.models.image_sources.known.images import (
     Mirrors,
-    initial_log_amplitudes,
-    most_mirrors,
     walls_of_file,
 )
 from gsparc.physics.mirror_planes import images
@@ -64,17 +62,6 @@ def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
     assert len(mirrors.visible_sequences([0], transmitter, far, 2, 20, False)) == 2
     behind = far + torch.tensor([-100.0, 0, 0])
     assert len(mirrors.obstacles_of(sequences, transmitter, behind).patches) == 0
-
-
-def test_long_sequences_are_of_the_largest_walls():
-    assert [most_mirrors(6, length) for length in (1, 2, 3)] == [6, 6, 6]
-    assert [most_mirrors(100, length) for length in (1, 2, 3)] == [100, 55, 15]
-    assert most_mirrors(0, 2) == 0
-
-
-def test_amplitudes_fall_with_the_order():
-    found = initial_log_amplitudes(((), (0,), (0, 1)), 2.0).exp()
-    assert torch.allclose(found, torch.tensor([2.0, 1.2, 0.72]))
 
 
 NOTHING = np.zeros((0, 2, 3))
