@@ -30,7 +30,7 @@ def fitted(name, data, fold, tmp_path):
 
 @pytest.mark.parametrize("static_end", ["rx", "tx"])
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "kriging"])
 def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind, static_end):
     data, fold = campaign(kind, 30, static_end), folds(30).folds[0]
     method = fitted(name, data, fold, tmp_path)

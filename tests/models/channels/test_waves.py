@@ -279,6 +279,13 @@ def test_channels_of_two_rows_were_divided_by_no_row(count):
     assert torch.isfinite(torch.view_as_real(field.predict(data.batch(np.arange(12))).mean)).all()
 
 
+def test_channels_of_no_known_carrier_are_refused():
+    data = _sent(12)
+    unknown = replace(data, site=replace(data.site, carrier_hz=None))
+    with pytest.raises(ValueError, match="known carrier"):
+        fitted_to(ChannelField(), unknown, np.arange(12))
+
+
 def test_tones_far_apart_are_bands_of_their_own():
     tones = 2.4e9 + 1e6 * np.arange(40)
     found = coherent_bands(tones, 10.0)

@@ -91,6 +91,12 @@ def test_without_the_ray_tracer_it_says_what_to_install(monkeypatch):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize("settings", [{"start": "glass"}, {"steps": -1}, {"depth": 9}, {"samples": 0}])
+def test_settings_that_cannot_be_are_refused(settings):
+    with pytest.raises(ValueError):
+        CalibratedRayTracer(**settings)
+
+
 def test_other_data_are_refused():
     own = measurements(np.ones(60))
     unknown = from_arrays({"rssi": np.ones(60), "rx_position": places(), "tx_position": STATION})
