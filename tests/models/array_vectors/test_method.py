@@ -77,6 +77,8 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     data, truth = known_campaign
     partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
+    seen, twins = (spectra(data.site, torch.from_numpy(v)) for v in (scale, twin_vectors(scale, partner)))
+    torch.testing.assert_close(seen, twins)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
     mixed[::3] = twin_vectors(mixed[::3], partner)
     kernel = Kernel.of_one(0.2, 1e-3, term=SmoothRough)

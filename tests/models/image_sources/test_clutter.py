@@ -187,6 +187,18 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     return _unexplained(rows, _bare()), clutter
 
 
+def test_candidates_are_met_where_unfolded_paths_meet_them():
+    """By itself, after a wall, and before one."""
+    rows, planes = _rows(40), torch.cat([WALLS[:1], TABLE[None]])
+    found = finite_mirrors._sources(rows, TRANSMITTER, TABLE[None], WALLS[:1])
+    for (_, met), (word, corner) in zip(found, (((1,), 0), ((0, 1), 0), ((1, 0), 1)), strict=True):
+        paths = Unfolding(TRANSMITTER, planes, (word,)).paths(rows.position)
+        seen = torch.isfinite(met[0, :, 0]) & paths.valid[0]
+        apart = (met[0, seen] - paths.end[0, seen, corner]).norm(dim=1)
+        # Both orders of perpendicular mirrors have one image; few places see it in the second.
+        assert len(apart) and (apart < 1e-3).float().mean() > 0.9
+
+
 def test_a_table_top_is_found_by_its_reflections():
     left, clutter = _beside_a_table(200)
     best = find_small_mirrors(left, 3)[0]

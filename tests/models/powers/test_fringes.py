@@ -100,7 +100,8 @@ def test_rows_are_predicted_by_solutions_that_never_saw_them(interfering):
     error = db(found.mean) - db(data.targets(found.rows))
     batch = data.batch(np.arange(400))
     seen = db(field.predict(batch).mean) - db(batch.target)
-    assert np.mean(error**2) > np.mean(seen**2)
+    alone = field.powers.left_out(field.at)[0].numpy().reshape(-1) - db(data.targets(found.rows))
+    assert np.mean(seen**2) < np.mean(error**2) < 0.97 * np.mean(alone**2)
 
 
 def test_state_makes_it_again(interfering, tmp_path):
