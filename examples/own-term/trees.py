@@ -7,8 +7,6 @@ from torch import Tensor
 
 from gsparc.processes.term import Columns
 
-DB_A_METRE = 0.1  # deviation before any row, of the process's: 5 dB of shadowing allow .5 dB a metre
-
 
 @dataclass(frozen=True)
 class Trees(Columns):
@@ -16,9 +14,11 @@ class Trees(Columns):
 
     Attributes:
         corners: (k, 2) of a convex polygon, counterclockwise [m].
+        prior_db: mean and deviation of the loss before any row [dB a metre].
     """
 
     corners: list[list[float]]
+    prior_db: tuple[float, float] = (0.0, 0.5)
 
     def columns(self, places: Tensor) -> Tensor:
         """Return the lengths inside (n, 1), clipped edge by edge (M. Cyrus, J. Beck 1978)."""
@@ -34,4 +34,4 @@ class Trees(Columns):
             leaves = torch.where(slope < 0, leaves.minimum(met), leaves)
             leaves = torch.where((slope == 0) & (gap < 0), 0.0, leaves)
         inside = (leaves - enters).clamp_min(0.0) * torch.linalg.vector_norm(way, dim=1)
-        return DB_A_METRE * inside[:, None]
+        return inside[:, None]

@@ -72,10 +72,7 @@ def refuse_foreign(path: Any) -> None:
     if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in OF_FILES):
-        raise ValueError(
-            f"the file asks to run {path!r}, which is not a class of gsparc; refused (a term of your own: "
-            "import the file that defines it first)"
-        )
+        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")
 
 
 GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}

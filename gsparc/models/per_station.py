@@ -31,6 +31,7 @@ from gsparc.models import checkpoint, fitting
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
+from gsparc.models.powers.own_terms import over_stations
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
@@ -128,7 +129,7 @@ class PerStation(Method):
         """
         budget = context.time_budget()
         numbers = self._numbers(data, fold, context)
-        self.site, notes = data.site, []
+        self.site, notes = data.site, list[str]()
         left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and left is None:  # of an earlier run in this folder
@@ -168,10 +169,13 @@ class PerStation(Method):
 
         fits = dict(run_each(fitted, range(len(numbers)), f"stations of {self.name}"))
         reports = [fits[turn][1] for turn in range(len(numbers))]
+        heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
+        learned = over_stations([note for one in heard for note in one.notes])
+        notes += dict.fromkeys(learned.values())
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
-            notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes]
+            notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
         limited = less_repeatable(*(one.limited_by for one in reports))
         return FitReport(
             budget.counted.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())

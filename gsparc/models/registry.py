@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from functools import cache
-from importlib import resources
+from importlib import import_module, resources
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -67,17 +67,33 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     if target is None:
         raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
     from gsparc.models.method import MethodFactory
-    from gsparc.processes.stored import KINDS
+    from gsparc.processes.stored import find_kind
 
+    terms = set(iterate_targets(OmegaConf.to_container(OmegaConf.create({"": node.get("terms")}))))
+    for path in terms:
+        if trusted:
+            _import_term(path)
+        else:
+            find_kind(str(path))
     if not trusted:
-        for path in iterate_targets(OmegaConf.to_container(node, resolve=False)):
-            if path not in KINDS:  # a term of the user's that they have imported
-                refuse_foreign(path)
+        for path in set(iterate_targets(OmegaConf.to_container(node, resolve=False))) - terms:
+            refuse_foreign(path)
     with heeded.apart():  # what is handed on is not used yet
         method = instantiate(fill_defaults(deepcopy(node)), _convert_="all")
     if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method
+
+
+def _import_term(path: str) -> None:
+    """Raise a `ValueError` that says what to do where a term's class cannot be imported."""
+    module, _, name = path.rpartition(".")
+    try:
+        getattr(import_module(module), name)
+    except Exception as error:  # whatever the file of a user does when it is imported
+        why = f"{type(error).__name__}: {error}".splitlines()[0]
+        say = "say PYTHONPATH=FOLDER of its file before the command"
+        raise ValueError(f"model.terms: {path} cannot be imported ({why}); {say}") from None
 
 
 def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:

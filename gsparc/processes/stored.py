@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 PLUGINS = "gsparc.terms"  # entry points of installed kinds
+MAIN = "__main__"  # module of what a notebook or script defines
 KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
 
 
@@ -58,7 +59,7 @@ def restored(part: Any) -> Any:
     """Return what `stored` was given; lists as tuples.
 
     Raises:
-        ValueError: nothing that was imported defines a kind of this name.
+        ValueError: see `find_kind`.
     """
     if isinstance(part, list):
         return tuple(restored(each) for each in part)
@@ -66,11 +67,25 @@ def restored(part: Any) -> Any:
         return part
     if "array" in part:
         return part["array"].numpy()
-    name = str(part["kind"])
+    return find_kind(str(part["kind"])).read(part["state"])
+
+
+def find_kind(name: str) -> type[Stored]:
+    """Return the kind that `stored` names so, of what was imported or is installed.
+
+    Raises:
+        ValueError: there is none.
+    """
     if name not in KINDS:
         for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
             if f"{point.module}.{point.attr}" == name:
                 point.load()
-    if name not in KINDS:
-        raise ValueError(f"no term is called {name!r}: import the file that defines it before it is read")
-    return KINDS[name].read(part["state"])
+    if name in KINDS:
+        return KINDS[name]
+    module = name.rpartition(".")[0]
+    if module == MAIN:
+        raise ValueError(f"{name!r} is of a notebook or script: define it here, too, before it is read")
+    raise ValueError(
+        f"a term {name!r} is not known: in Python `import {module}` first; for commands install a package "
+        f"that names it in the group {PLUGINS} of its entry points, see docs/terms.md"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
@@ -43,11 +44,22 @@ class Term(Stored, ABC, Generic[Rows]):
 
 
 class Columns(Term[Tensor]):
-    """A term of places (n, D) [m] that is linear in weights of unit variance, times the prior's deviation."""
+    """A term of places (n, D) [m] that is linear in weights, of unit variance times the prior's deviation.
+
+    Attributes:
+        prior_db: mean and deviation of each weight of a user's term [dB of a column's unit]; None: 0, and
+            that of the process. A field of this name makes it a setting.
+    """
+
+    prior_db: Sequence[float] | None = None
 
     @abstractmethod
     def columns(self, places: Tensor) -> Tensor:
         """Return what each weight adds (n, Q) at places (n, D) [m], differentiable in these."""
+
+    def mean(self, places: Tensor) -> Tensor:
+        """Return the mean (n,) at places (n, D) [m], before any row."""
+        return places.new_zeros(len(places))
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """See `Term`."""

@@ -128,7 +128,8 @@ class Trend(Columns):
 
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
-        return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
+        mean = places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
+        return sum((term.mean(places) for term in self.more), mean)
 
     def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean (n,) and `columns` (n, Q)."""

@@ -26,6 +26,8 @@ def _said(path):
 
 
 def test_good_file_is_described(tmp_path, arrays):
+    write_own(tmp_path / "a.npz", arrays)
+    assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]
     write_own(tmp_path / "hall [b].h5", {**arrays, "frequency_hz": np.array(3e9), "junk": np.ones(2)})
     good, text = _said(tmp_path / "hall [b].h5")
     assert good
@@ -76,11 +78,6 @@ def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
 def test_path_that_is_not_utf8(tmp_path):
     good, text = _said(tmp_path / "\udcff.npz")
     assert not good and "no such file" in text
-
-
-def test_unknown_carrier_is_said(tmp_path, arrays):
-    write_own(tmp_path / "a.npz", arrays)
-    assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]
 
 
 def test_each_problem_is_one_line(tmp_path, arrays):

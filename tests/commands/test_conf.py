@@ -7,7 +7,7 @@ from pathlib import Path
 import hydra
 import pytest
 import yaml
-from campaigns import brief, compose, spectra
+from campaigns import compose, spectra
 from doors import knock
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
@@ -79,24 +79,6 @@ def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
     assert OmegaConf.to_container(as_said) == OmegaConf.to_container(config)
 
 
-def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
-    """A new `auto` must be settled (models/splat/auto_settings.py, models/terms.py) and be named here."""
-
-    def still_open(node: dict, prefix: str = ""):
-        for key, value in node.items():
-            if isinstance(value, dict):
-                yield from still_open(value, f"{prefix}{key}.")
-            elif value == "auto":
-                yield f"{prefix}{key}"
-
-    model = OmegaConf.to_container(compose().model, resolve=False)
-    assert set(still_open(model)) == {
-        "emission.encoding.kind", "emission.activation", "emission.init_bias", "effects.image",
-        "effects.array", "effects.moving_array", "effects.phase", "effects.power", "effects.visibility",
-        "effects.residual", "steps",
-    }  # fmt: skip
-
-
 def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
     """Also those that its file leaves to its class."""
     given = "model=idw", "model.power=3", "dataset=own", f"dataset.file={spectra(tmp_path / 'own.npz')}"
@@ -127,22 +109,3 @@ def test_the_paper_leaves_nothing_to_auto():
     values = [config.init.name, settings.emission.activation, settings.emission.encoding.kind]
     assert "auto" not in [*values, settings.emission.init_bias, *config.model.effects.values()]
     assert len(config.model.guesses) > 5
-
-
-def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
-    assert "/gsparc-paper/" in composed(monkeypatch, "paper=gsparc").hydra.run.dir
-
-
-@pytest.mark.slow
-def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
-    """`-m model.emission.hidden=0,8`: 0 starts in closed form, 8 cannot; both are said and both train."""
-    given = brief(
-        spectra(tmp_path / "own.npz"), "trainer.max_steps=4", f"hydra.sweep.dir={tmp_path / 'sweep'}"
-    )
-    done = knock(main, "train.py", ["-m", "model.emission.hidden=0,8", *given])
-    assert done.status == 0, done
-    folders = sorted(p.parent.name for p in (tmp_path / "sweep").glob("*/summary.json"))
-    assert folders == ["0", "1"]
-    logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]
-    said = [next(path.parent.glob("*.log")).read_text() for path in logs]
-    assert "init=auto -> images" in said[0] and "init=auto -> sphere" in said[1]

@@ -1,11 +1,9 @@
 """The command: a checkpoint and a folder in, summary.json and a table out, one line on error."""
 
 import json
+import os
 import re
 import sys
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,10 +11,12 @@ import towns
 import yaml
 from campaigns import channels, powers
 from doors import assert_refused, knock
+from mirrors import mirrored
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
+from gsparc.data.public.fetch import MIRROR
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint, loading
 
@@ -135,40 +135,21 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
     assert "no baselines: the file that the model was trained on is gone, or another" in remarks(found.facts)
 
 
-class Asked(BaseHTTPRequestHandler):
-    """Notes what it is asked for."""
-
-    paths: ClassVar[list[str]] = []
-
-    def do_GET(self):
-        self.paths.append(self.path)
-        self.send_error(404)
-
-    do_HEAD = do_GET
-
-    def log_message(self, *unused):
-        pass
-
-
 @pytest.fixture
-def stranger():
-    """`(address, paths)` of a server that is somebody else's."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Asked)
-    Asked.paths.clear()
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}", Asked.paths
-    server.shutdown()
-    server.server_close()
+def mirror(monkeypatch):
+    """A server that is somebody else's, and notes what it is asked for."""
+    with mirrored(monkeypatch) as server:
+        yield server
 
 
 @pytest.mark.parametrize(
     ("secret", "refused"),
     [("${oc.env:GSPARC_TOKEN}", r"has \$\{\.\.\.\}"), ("plain", r"dataset\.file is an address, http.*; say")],
 )
-def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatch, stranger, secret, refused):
+def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatch, mirror, secret, refused):
     """A stored `dataset.file=http://HOST/${oc.env:NAME}.parquet` was asked for, twice."""
     monkeypatch.setenv("GSPARC_TOKEN", "very-secret")
-    address, asked = stranger
+    address = os.environ[MIRROR].rstrip("/")
     method, stored = loading.load(trained)
     config = yaml.safe_load(stored.config)
     config["dataset"] |= {"file": f"{address}/{secret}.parquet", "cell_m": 1.0}
@@ -180,6 +161,6 @@ def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatc
     if secret == "plain":  # what the user names is asked
         with pytest.raises(ValueError, match="damaged or not a Parquet file"):
             evaluate_files([bad], {"file": f"{address}/mine.parquet"})
-        assert set(asked) == {"/mine.parquet"}
+        assert set(mirror.asked) == {"/mine.parquet"}
     else:
-        assert not asked
+        assert not mirror.asked

@@ -59,10 +59,10 @@ def test_places_areas_and_pictures_are_written(trained, tmp_path):
 def test_a_file_without_places_is_located_too(trained, tmp_path):
     file = tmp_path / "other.npz"
     with np.load(spectra(tmp_path / "all.npz", rows=80)) as stored:
-        true = stored["tx_position"][:6]
-        np.savez(file, spectrum=stored["spectrum"][:6], rx_position=stored["rx_position"])
+        true = stored["tx_position"][:3]
+        np.savez(file, spectrum=stored["spectrum"][:3], rx_position=stored["rx_position"])
     _, rows = located(tmp_path / "run", f"ckpt={trained}", f"data='{file}'", "calibrate=0")
-    assert len(rows) == 6 and set(rows[0]) == UNPLACED
+    assert len(rows) == 3 and set(rows[0]) == UNPLACED
     found = np.stack([column(rows, axis) for axis in "xyz"], 1)
     assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
 
@@ -73,7 +73,7 @@ def test_nobody_is_located_in_a_wall(trained, tmp_path):
     Image.fromarray(plan).save(tmp_path / "plan.png")
     low, high = (site := checkpoint.read(trained).site).moving_box[:, :2] + site.origin[:2]
     points = f"plan_points=[[0,40,{low[0]},{low[1]}],[100,40,{high[0]},{low[1]}]]"
-    given = f"ckpt={trained}", "calibrate=0", "rows=8", f"plan='{tmp_path}/plan.png'", points
+    given = f"ckpt={trained}", "calibrate=0", "rows=5", f"plan='{tmp_path}/plan.png'", points
     _, rows = located(tmp_path / "run", *given)
     wall = 0.5 * (low + high)[0] + 0.3
     assert (column(rows, "x") <= wall).all() and (column(rows, "x_true") > wall).any()

@@ -188,13 +188,6 @@ def test_stations_at_unknown_places(tmp_path):
         method.fit(data, Fold(heard, rows[:0], rows), FitContext(tmp_path, stations="each"))
 
 
-def test_an_unknown_transmitter(tmp_path):
-    model = fitted({"rx_position": walk(), "rssi_db": powers(walk())[:, 0]}, tmp_path)
-    found = answered(model, tmp_path, "xyz", walk()[:5])
-    assert list(found[0]) == ["x", "y", "z", "rssi_db", "rssi_db_std", "confidence"]
-    assert np.abs(column(found, "rssi_db") - powers(walk())[:5, 0]).max() < 3
-
-
 def test_a_height_that_is_not_given(town, valley, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     found = answered(town, tmp_path, "xy", [[5, 5], [6, 6]])
@@ -247,20 +240,12 @@ def test_watts_were_answered_in_decibels(tmp_path):
 BAD_TABLES = {
     "latitude 95": ("lat,lon,height\n47,11,2\n95,11,2\n", r"column 'lat', line 3: 95: latitude is outside"),
     "no value": ("lat,lon,height\n47,,2\n", r"column 'lon', line 2: no value"),
-    "text": ("lat,lon,height\n47,east,2\n", r"column 'lon', line 2: 'east': is no finite number"),
-    "infinite": ("lat,lon,height\n47,11,inf\n", r"column 'height', line 2: 'inf'"),
-    "no rows": ("lat,lon,height\n", r"there are no rows below it"),
-    "empty": ("", r"empty"),
     "no coordinates": ("time,speed\n1,2\n",
         r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat"),
     "half": ("lat,height\n47,2\n", r"latitude is there but no longitude; say columns\.longitude=COLUMN"),
     "far": ("x,y,z\n1,1,2\n2e7,0,2\n", r"line 3: \(2e\+07, 0, 2\) is more than 10000 km"),
-    "the other side": ("lat,lon,height\n-47,-169,2\n", r"line 2: .*more than 10000 km"),
-    "high": ("lat,lon,height\n47,11,1e9\n", r"line 2: .*more than 10000 km"),
     "another end": ("tx_lat,tx_lon\n47,11\n", r"no coordinates of the receiver"),
     "no station": ("lat,lon,height,cell\n47,11,2,\n", r"column 'cell', line 2: no station"),
-    "two columns": ("lat,latitude (deg),lon,height\n1,1,1,1\n",
-        r"could each be latitude; say which: columns\."),
 }  # fmt: skip
 
 
@@ -276,9 +261,7 @@ def test_tables_that_hold_no_places_are_refused(valley, tmp_path, name):
 PLACE = np.array([47.0, 47.001])
 BAD_ARRAYS = {
     "nan": ({"latitude": PLACE * [1, np.nan]}, r"'latitude', row 1: no value"),
-    "beyond": ({"latitude": PLACE + np.array([0, 90])}, r"row 1: 137\.001: latitude is outside"),
     "lengths": ({"latitude": PLACE[:1]}, r"longitude: expected 1 values, one a row, found .2,"),
-    "heights": ({"rx_height": np.ones(3)}, r"z: expected 2 values, one a row, found .3,"),
     "text": ({"longitude": np.array(["a", "b"])}, r"longitude: expected real numbers, found dtype <U1"),
     "stations": ({"station": np.zeros(3, int)}, r"station: expected 2 values"),
     "number": ({"station": np.array([0, 7]), "station_name": np.array(["a"])}, r"row 1: 7 is none of the 1"),
@@ -295,12 +278,6 @@ def test_arrays_that_hold_no_places_are_refused(valley, tmp_path, name):
     np.savez(tmp_path / "a.npz", **{key: value for key, value in arrays.items() if value is not None})
     with pytest.raises(DataError, match=said):
         predict_file(valley, tmp_path / "a.npz")
-
-
-def test_degrees_where_the_model_knows_none(town, tmp_path):
-    file = write_table(tmp_path / "a.csv", ["lat", "lon"], [[47, 11]])
-    with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
-        predict_file(town, file)
 
 
 def test_where_the_answers_go(town, tmp_path):
@@ -323,6 +300,8 @@ def test_where_the_answers_go(town, tmp_path):
         predict_file(town, tmp_path / "b.npz", tmp_path / "c.csv", columns={"x": "b"})
     with pytest.raises(DataError, match="no such file"):
         predict_file(town, tmp_path / "absent.csv")
+    with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
+        predict_file(town, write_table(tmp_path / "d.csv", ["lat", "lon"], [[47, 11]]))
 
 
 def test_places_far_outside_are_counted(town, tmp_path, caplog):

@@ -1,17 +1,13 @@
 """What a training goes on from and starts from: an interrupt, a checkpoint, the weights of another."""
 
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from campaigns import FROZEN, brief, channels, compose, plain, short, spectra, weights
+from campaigns import FROZEN, brief, compose, plain, short, spectra, weights
 from doors import assert_refused, knock
 from lightning.pytorch import Trainer
 
@@ -140,8 +136,6 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("others")
     files = {
         "rx": spectra(folder / "rx.npz", moving="rx"),
-        "csi": channels(folder / "csi.npz"),
-        "far": spectra(folder / "far.npz", origin=100.0),
     }
     _, nearest = train(plain(spectra_file, "nearest"), folder / "nearest")
     return files | {"model": halfway.checkpoints[0], "nearest": nearest.checkpoints[0]}
@@ -156,8 +150,6 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
         (["ckpt_path=gone.ckpt"], r"gone\.ckpt: no such file"),
         (["init_from=none.ckpt"], r"init_from=none\.ckpt: .*no such checkpoint"),
         (["init_from={model}", "dataset.file={rx}"], "init_from=.*trained with static_end rx"),
-        (["init_from={model}", "dataset.file={csi}"], "init_from=.*trained with kind spectrum"),
-        (["init_from={model}", "dataset.file={far}"], "init_from=.*from the model's"),
         (["init_from={model}", "model=nearest"], "init_from: nearest takes no weights to start from"),
         (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
     ],
@@ -205,19 +197,3 @@ def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     resumed = checkpoint.read(tmp_path / "on" / "model.ckpt").configuration
     assert resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
     assert resumed["seed"] == 0 and resumed["trainer"]["max_steps"] == 20
-
-
-@pytest.mark.slow
-def test_an_interrupted_process_ends_with_130_and_one_line(spectra_file, tmp_path):
-    run, often = tmp_path / "run", "callbacks.checkpoint.interval=10"
-    words = brief(spectra_file, "trainer.max_steps=100000", often, f"hydra.run.dir={run}")
-    process = subprocess.Popen(
-        [sys.executable, "train.py", *words], cwd=ROOT, stderr=subprocess.PIPE, text=True
-    )
-    until = time.monotonic() + 120
-    while not (run / "last.ckpt").exists() and time.monotonic() < until:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and f"go on with ckpt_path={run / 'last.ckpt'}" in err
-    assert "Traceback" not in err

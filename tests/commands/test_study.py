@@ -37,14 +37,6 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
     assert (tmp_path / "study.png").stat().st_size > 10_000
 
 
-def test_each_kind_has_its_variants_and_baselines():
-    effects, positions, measured = (study_of(compose(f"kind={kind}", config="study")) for kind in LINES)
-    names = [*effects.variants]
-    assert names[0] == "plain" and {"array", "phase", "power", "gp"} <= set(names)
-    assert [*positions.variants] == [*measured.variants]
-    assert len(positions.conditions) == 19 and len(measured.conditions) == 4 and measured.rounds == 3
-
-
 def test_variants_join_the_models_settings_where_they_are_interpolations():
     """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
     makers = study_of(compose("kind=effects", config="study")).variants

@@ -99,12 +99,6 @@ def test_the_hash_is_that_of_all_bytes_as_it_was(small):
     assert content_hash(named) == digest.hexdigest()
 
 
-def test_blocks_are_all_rows_in_their_order(small):
-    values = np.arange(700.0).reshape(70, 10)
-    assert np.array_equal(np.concatenate([values[part] for part in blocks.row_blocks(values)]), values)
-    assert len(list(blocks.row_blocks(np.zeros((0, 3))))) == 1
-
-
 def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_path, small, monkeypatch):
     """50,000 pictures were 1.6 GB in memory, and as much again for each method that copied its rows."""
     root = write_release(tmp_path / "release")

@@ -11,7 +11,6 @@ from gsparc.data.datamodule import (
     DataModule,
     Loaded,
     StepLoader,
-    rows_of_device,
     rows_of_step,
     steps_per_epoch,
 )
@@ -122,6 +121,7 @@ NO_MODULE = "is no gsparc.data.datamodule.DataModule"
         ({"name": "own", "file": "x", "batch_size": 0}, "dataset.batch_size=0: a whole number of at least 1"),
         *(({"name": typo}, f"did you mean '{name}'") for typo, name in TYPOS.items()),
         ({"name": "own"}, "dataset.file is not set"),
+        ({"name": "ble", "root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
     ],
 )  # fmt: skip
 def test_what_is_no_dataset_is_refused_in_one_line(refused, settings, says):
@@ -159,15 +159,6 @@ def test_a_subclass_needs_load_alone(csi_arrays, tmp_path):
     _fit(module.use(FOLD, seed=3), tmp_path, recorder, steps=2)
     assert recorder.seen == [rows_of_step(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
     assert [b.index.tolist() for b in module.test_dataloader()] == [FOLD.test.tolist()]
-
-
-@pytest.mark.parametrize(("rows", "devices"), [(8, 2), (5, 2), (1, 3), (2, 3)])
-def test_devices_share_every_batch_and_none_is_left_out(rows, devices):
-    shares = [rows_of_device(np.arange(rows), rank, devices) for rank in range(devices)]
-    assert all(len(part) for part in shares)
-    assert set(np.concatenate(shares)) == set(range(rows))
-    if rows >= devices:
-        assert sum(map(len, shares)) == rows
 
 
 @pytest.mark.parametrize(("batch", "devices"), [(4, 2), (3, 2), (1, 2), (2, 3)])

@@ -61,11 +61,14 @@ def test_they_are_of_training_rows_alone_and_a_pure_function(name):
     assert any(not np.array_equal(a.test, b.test) for a, b in zip(inner.folds, other.folds, strict=True))
 
 
-def test_blocks_are_the_same_squares_of_floor():
+@pytest.mark.parametrize("side", [SIDE, None])
+def test_blocks_are_the_same_squares_of_floor(side):
+    """Where none was said they are a tenth of the site, inside as outside."""
     positions = floor()
-    outer, inner = both("blocks", positions, share=0.15)
+    outer, inner = both("blocks", positions, share=0.15, side_m=side)
     low = positions[:, :2] - positions[:, :2].min(axis=0)
-    square = np.unique(np.floor(low / SIDE), axis=0, return_inverse=True)[1].reshape(-1)
+    width = side or np.ptp(low, axis=0).max() / 10 * (1 + 2e-6)
+    square = np.unique(np.floor(low / width), axis=0, return_inverse=True)[1].reshape(-1)
     for fold in (outer, *inner.folds):
         assert not np.isin(square[fold.test], square[np.union1d(fold.train, fold.val)]).any()
     tested = np.concatenate([fold.test for fold in inner.folds])
@@ -73,18 +76,6 @@ def test_blocks_are_the_same_squares_of_floor():
     assert shared < 0.15  # draws that overlap little are taken
     units = inner.unit[tested]
     assert len(np.unique(units)) == len(np.unique(square[tested]))
-
-
-def test_the_side_of_squares_is_the_outer_one_where_it_was_not_said():
-    positions = floor()
-    settings = SplitSettings("blocks")  # a tenth of the site
-    outer = make_split(positions - positions.min(axis=0), settings).folds[0]
-    inner = inner_folds(positions, outer, settings, 3, 0)
-    side = np.ptp(positions[:, :2], axis=0).max() / 10 * (1 + 2e-6)
-    low = positions[:, :2] - positions[:, :2].min(axis=0)
-    square = np.unique(np.floor(low / side), axis=0, return_inverse=True)[1].reshape(-1)
-    for fold in inner.folds:
-        assert not np.isin(square[fold.test], square[fold.train]).any()
 
 
 def test_squares_are_made_smaller_where_two_are_left():
@@ -102,17 +93,6 @@ def test_thinned_rows_are_not_thinned_again():
     assert all(len(fold.train) + len(fold.val) == 80 for fold in inner.folds)
     outer, inner = both("sparse", positions)
     assert all(len(f.train) + len(f.val) == 0.8 * 180 for f in inner.folds)
-
-
-@pytest.mark.parametrize("name", ["random", "blocks"])
-def test_a_place_visited_again_is_left_out_whole(name):
-    places = floor(200)
-    place = np.repeat(np.arange(200), 3)
-    positions, settings = places[place], settings_of(name)
-    outer = make_split(positions, settings, place=place).folds[0]
-    for fold in inner_folds(positions, outer, settings, 3, 0, place).folds:
-        assert not np.isin(place[fold.test], place[np.union1d(fold.train, fold.val)]).any()
-        assert not np.isin(place[fold.val], place[fold.train]).any()
 
 
 @pytest.mark.parametrize("together", [0, 2])

@@ -46,16 +46,6 @@ def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_a
     assert from_arrays(spectrum_arrays).site.sha256 not in hashes
 
 
-def test_shapes_of_csi(csi_arrays):
-    del csi_arrays["array_position"]
-    one = {**csi_arrays, "csi": csi_arrays["csi"][:, 0, 0], "frequency_hz": 2.4e9}
-    assert from_arrays(one).target.shape == (12, 1, 1)
-    band = {**csi_arrays, "csi": csi_arrays["csi"][:, 0]}
-    assert from_arrays(band).target.shape == (12, 1, 3)
-    antennas = {**csi_arrays, "csi": csi_arrays["csi"][:, :, :1], "frequency_hz": np.array([2.4e9])}
-    assert from_arrays(antennas).target.shape == (12, 2, 1)
-
-
 def test_spectra_are_brought_to_unit_scale(spectrum_arrays):
     assert from_arrays(spectrum_arrays).site.target_scale == 1
     tiny = from_arrays({**spectrum_arrays, "spectrum": spectrum_arrays["spectrum"] * 1e-9})

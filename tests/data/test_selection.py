@@ -124,13 +124,6 @@ def test_a_fault_is_not_a_signal_below_the_sensitivity():
     assert (data.censored == 1).sum() == 2 and level(data)[data.censored == 0].min() >= least - 1e-4
 
 
-def test_fewer_rows_cover_the_campaign():
-    rows = selection._spread(np.arange(1000), 100).nonzero()[0]
-    assert len(rows) == 100 and (rows // 10).tolist() == list(range(100))
-    assert len(set(rows % 10)) > 5  # not in step with a raster of ten columns
-    assert np.array_equal(rows, selection._spread(np.arange(1000), 100).nonzero()[0])
-
-
 @pytest.mark.parametrize("most", [2, 7, 39, 40])
 def test_the_number_of_rows_is_met(most):
     read = part(plain(40), max_rows=most)

@@ -152,6 +152,8 @@ def test_impossible_splits_are_refused():
         make_split(_walk(8), SplitSettings("grouped"))
     with pytest.raises(DataError, match="fold 0 has 0 training"):
         make_split(_walk(40), SplitSettings("grouped", buffer_m=10.0))
+    with pytest.raises(DataError, match="too few to hold some out"):
+        make_split(_walk(), SplitSettings("blocks", side_m=5000))
 
 
 def test_split_for_reads_the_config_group(rfid_folder, tmp_path):
@@ -205,14 +207,6 @@ def test_blocks_are_whole_squares_until_the_share_is_reached():
     parts = [set(square[part]) for part in (fold.train, fold.val, fold.test)]
     assert not parts[0] & parts[1] and not parts[0] & parts[2] and not parts[1] & parts[2]
     assert len(fold.val) >= 0.1 * (len(fold.train) + len(fold.val))
-
-
-def test_blocks_without_a_side_are_a_tenth_of_the_site():
-    positions = np.random.default_rng(0).uniform(0, 1000, (900, 3))
-    fold = make_split(positions, SplitSettings("blocks")).folds[0]
-    assert len(np.unique(np.floor(positions[fold.test, :2] / 99.8), axis=0)) < 35
-    with pytest.raises(DataError, match="too few to hold some out"):
-        make_split(positions, SplitSettings("blocks", side_m=5000))
 
 
 @pytest.mark.parametrize("name", ["random", "grouped", "blocks", "corner"])

@@ -143,14 +143,6 @@ def draw(rng: np.random.Generator) -> Drive:
     )  # fmt: skip
 
 
-def in_another_unit(drive, rng):
-    unit = str(rng.choice(list(LENGTHS)))
-    heads = [h for h in drive.columns if h.split("_")[-1] in ("x", "y", "z")]
-    style = ("{} [{}]", "{} ({})", "{}_{}", "{}/{}")[rng.integers(4)]
-    changed = replace(drive.with_values(heads, lambda v: v / LENGTHS[unit]), digits=8)
-    return changed, {head: style.format(head, unit) for head in heads}
-
-
 class Changes:
     """Each makes of a table another one and says what must come of it; None where it cannot be made."""
 
@@ -167,15 +159,12 @@ class Changes:
             return replace(drive, listed={h: v[::-1] for h, v in drive.listed.items()}), SAME
 
     def another_unit(drive, rng):
-        changed, names = in_another_unit(drive, rng)
-        if names:
-            return changed.renamed(names), SAME
-
-    def a_unit_lost(drive, rng):
-        changed, names = in_another_unit(drive, rng)
-        if names:
-            del names[str(rng.choice(list(names)))]
-            return changed.renamed(names), REFUSED
+        unit = str(rng.choice(list(LENGTHS)))
+        heads = [h for h in drive.columns if h.split("_")[-1] in ("x", "y", "z")]
+        style = ("{} [{}]", "{} ({})", "{}_{}", "{}/{}")[rng.integers(4)]
+        if heads:
+            changed = replace(drive.with_values(heads, lambda v: v / LENGTHS[unit]), digits=8)
+            return changed.renamed({head: style.format(head, unit) for head in heads}), SAME
 
     def radians(drive, rng):
         heads = [h for h in drive.columns if h.endswith(("lat", "lon"))]
@@ -252,14 +241,6 @@ class Changes:
             numbers = [str(drive.listed["name"].index(name)) for name in drive.columns[head]]
             return replace(drive, columns={**drive.columns, head: numbers}), REFUSED
 
-    def two_lines_in_one(drive, rng):
-        row, lines = -1 - int(rng.integers(COUNT - 1)), drive.lines()
-        return replace(drive.with_line(row, lines[row] + lines[row])), REFUSED
-
-    def other_heads(drive, rng):
-        names = {"lat": "Latitude (deg)", "lon": "GPS_Longitude", "x": "X [m]", "y": "Y_m", "z": "Height (m)"}
-        return drive.renamed({**names, "rssi": "RxPower_mean", "re": "real", "im": "H Imag"}), SAME
-
     def a_column_more(drive, rng):
         more = {
             "battery_level": 3.5, "rssi_delta": 1.0, "SINR": 12.0, "tx_power_dbm": 30.0, "time": "12:30:05",
@@ -267,10 +248,6 @@ class Changes:
         }  # fmt: skip
         head = str(rng.choice(list(more)))
         return replace(drive, columns={**drive.columns, head: [more[head]] * COUNT}), EITHER
-
-    def a_second_level(drive, rng):
-        if not drive.said:
-            return replace(drive, columns={"RSSI strongest": [-50.0] * COUNT, **drive.columns}), REFUSED
 
 
 CHANGES = [change for name, change in vars(Changes).items() if not name.startswith("_")]

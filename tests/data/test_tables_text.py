@@ -48,13 +48,6 @@ def test_comments_below_the_heads_are_said(write):
     assert "1 comments below the heads, the first in line 4" in table.notes
 
 
-def test_heads_in_a_comment_above_text(write):
-    arrays = understand_table(
-        write("# station,x,y,rssi,cell_x,cell_y\na,1,2,-80,0,0\nb,1,2,-81,5,5\n")
-    ).raw.arrays
-    assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rssi_db"].tolist() == [-80, -81]
-
-
 def test_a_no_break_space_between_columns(write):
     """Cells were counted by one rule and parsed by another: KeyError: 3."""
     arrays = understand_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).raw.arrays

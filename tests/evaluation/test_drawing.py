@@ -7,7 +7,7 @@ import pytest
 from campaigns import compose
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from gsparc.evaluation.drawing import GREY, METHODS, PALETTE, style_of
+from gsparc.evaluation.drawing import GREY, PALETTE, style_of
 
 # Linear RGB as seen without cones for red, green or blue (Machado, Oliveira and Fernandes 2009, severity 1).
 VISION = {
@@ -44,8 +44,3 @@ def test_four_methods_of_a_comparison_shared_one_colour():
         assert len(set(looks.values())) == len(names), kind
         plain = [one for name, one in looks.items() if not name.endswith("_together")]
         assert max(Counter((one.colour, one.second) for one in plain).values()) == 1, kind
-
-
-def test_methods_of_others_have_marks_of_their_own():
-    ours = {one.mark for one in METHODS.values()}
-    assert not {style_of(f"plugin{number}").mark for number in range(50)} & ours

@@ -13,7 +13,6 @@ from gsparc.evaluation.scores import score_methods
 from gsparc.evaluation.summary import decided_by_a_row, results_table, write_samples, write_summary
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.method import Method, Prediction
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
 
@@ -145,46 +144,11 @@ def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
         evaluate(method, None, data, split, clock=QUICK)
 
 
-class Remembering(Method):
-    """Keeps the rows it was asked about."""
-
-    name = "remembering"
-
-    def __init__(self, shape):
-        self.asked, self.shape = [], shape
-
-    def fit(self, data, fold, run_dir):
-        raise NotImplementedError
-
-    def predict(self, query):
-        self.asked.append(query.tx.clone())
-        return Prediction(torch.zeros(len(query), *self.shape))
-
-    def state(self):
-        return {}
-
-    def restore(self, site, state):
-        raise NotImplementedError
-
-
-def test_only_the_chosen_rows_are_asked_about(campaign, folds):
-    data, split = campaign("spectrum", 40), folds(40)
-    method = Remembering((12, 24))
-    evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK)
-    allowed = torch.from_numpy(data.tx[split.folds[0].val]).float()
-    for asked in method.asked:
-        assert (torch.cdist(asked, allowed).min(1).values < 1e-6).all()
-    assert {len(asked) for asked in method.asked} == {3, 1, 64}
-
-
 def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):
     """Ray marching took ten minutes to be timed in batches of 64."""
     monkeypatch.setattr("gsparc.evaluation.evaluate.SLOWEST_BATCH_MS", 0.0)
-    data, split = campaign("spectrum", 40), folds(40)
-    method = Remembering((12, 24))
-    facts = evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK).facts
+    facts = evaluated(Mean, campaign("spectrum", 40), folds(40), baselines=()).facts
     assert facts["time/render_ms_batch64"] is None and facts["time/render_ms_p50"] > 0
-    assert 64 not in {len(asked) for asked in method.asked}
 
 
 def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_path):

@@ -47,19 +47,7 @@ def test_walls_and_boxes_are_drawn_where_they_are(room, monkeypatch):
     assert f"z = {room.site.origin[2] - 1.0:.2f} m" in figure.get_suptitle()
 
 
-def test_a_slanted_plane_is_where_its_equation_holds(room, monkeypatch):
-    figure = drawn(monkeypatch, room, SiteObjects.of(PLANES[1:2]))
-    points = next(line.get_xydata() for line in figure.axes[0].lines if "mirror" in line.get_label())
-    np.testing.assert_allclose((points - room.site.origin[:2]) @ [HALF, HALF], 2.0)
-    assert len(figure.axes) == 1
-
-
 def test_a_wall_apart_from_all_places_was_beside_the_map(room, monkeypatch):
     apart = np.array([[1.0, 0, 0, 25.0], [1.0, 0, 0, 900.0]])
     axis = drawn(monkeypatch, room, SiteObjects.of(apart)).axes[0]
     assert 25 < axis.get_xlim()[1] - room.site.origin[0] < 60
-
-
-def test_objects_of_two_stations_stand_in_one_site():
-    both = SiteObjects.of(PLANES).joined(SiteObjects.of(boxes=BOX))
-    assert len(both) == 3 + 1

@@ -65,13 +65,6 @@ def test_levels_in_dbm_were_drawn_as_db(figures):
     assert {axis.get_ylabel() for axis in figures[-1].axes} >= {"level [dBm]", "received power [dBm]"}
 
 
-def test_channels_are_means_of_power():
-    csi = np.ones((20, 2, 3)) * np.array([1.0, 3.0])[:, None]
-    arrays = {"rx_position": scattered(20), "tx_position": np.zeros(3), "csi": csi * (1 + 0j)}
-    found = find_spots(from_arrays({**arrays, "frequency_hz": 1e9 + 1e6 * np.arange(3)}), None)
-    assert np.allclose(found.level_db, 10 * np.log10(5), atol=1e-4)
-
-
 def test_rows_that_are_wrong_are_marked(figures):
     place = scattered()
     place[17] = [5000, 300, 1]
@@ -111,18 +104,6 @@ def test_the_origin_of_degrees_is_said(figures):
     said = shown(data, figures)[1]
     assert f"metres east of {origin.longitude:g}° E" in said
     assert f"metres north of {-origin.latitude:g}° S" in said
-
-
-def test_many_stations_are_counted_and_not_named(figures):
-    arrays = {
-        "rx_position": scattered(), "station_position": scattered(16), "rssi_db": np.full((80, 16), -50.0),
-    }  # fmt: skip
-    arrays["station_name"] = np.array([f"post{i}" for i in range(16)])
-    said = shown(from_arrays(arrays), figures)[1]
-    assert "16 stations" in said and "post3" not in said
-    few = {name: values[:15] if name != "rx_position" else values for name, values in arrays.items()}
-    few["rssi_db"] = np.full((80, 15), -50.0)
-    assert "post3" in shown(from_arrays(few), figures)[1]
 
 
 def test_other_kinds_are_drawn_too(campaign, figures):

@@ -34,13 +34,5 @@ def test_each_tick_is_answered_or_missed(loop):
     np.testing.assert_allclose(np.linalg.norm(np.array(places) - [1, 2, 3], axis=1), loop.RADIUS)
 
 
-def test_the_histogram_holds_every_answer(loop):
-    text = loop.Run(np.array([1e-6, 3e-6, 4e-6, 900e-6]), 2).histogram()
-    assert [line.split()[:3] for line in text.splitlines()[:-1]] == [
-        ["1", "us", "1"], ["4", "us", "2"], ["1024", "us", "1"]
-    ]  # fmt: skip
-    assert "4 answered, 2 missed" in text and "worst 900 us" in text
-
-
 def test_without_a_field_it_says_how(loop, capsys):
     assert loop.main([]) == 2 and "field.gsparc" in capsys.readouterr().err

@@ -7,11 +7,7 @@ finite, untouched rows are bit-identical in everything, ids are permanent and un
 import math
 from types import SimpleNamespace
 
-import lightning.pytorch as L
-import pytest
 import torch
-from campaigns import spectra
-from contexts import trained
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented import invent
@@ -22,7 +18,6 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.field.module import NonFiniteLoss
 from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Pose
 
@@ -142,33 +137,3 @@ def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
     assert all(t.isfinite().all() for t in densify.statistics.values())
     learn(model, trainer.optimizers[0])
     assert all(p.isfinite().all() for p in model.parameters())
-
-
-class Fire(L.Callback):
-    """Gradients of the worst kinds instead of the right ones."""
-
-    def __init__(self, size: float, seed: int) -> None:
-        self.size, self.draw = size, torch.Generator().manual_seed(seed)
-
-    def on_before_optimizer_step(self, trainer, module, optimizer):
-        for parameter in module.parameters():
-            if parameter.grad is not None:
-                sign = torch.randn(parameter.shape, generator=self.draw).sign()
-                parameter.grad.copy_(self.size * sign if self.size else torch.zeros_like(sign))
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-38, 1.0, 1e18, 1e30, 3e38, math.inf, math.nan])
-def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_path, size):
-    """Densified, pruned and reset all the while; a run never goes on with a NaN."""
-    file = spectra(tmp_path / "own.npz")
-    densify = Densify(2, 30, 3, 0.0, 0.05, max_gaussians=80, min_gaussians=4, max_radius=50.0)
-    made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
-    try:
-        method, _ = trained(file, tmp_path, 24, "init=sphere", callbacks=lambda: made)
-    except NonFiniteLoss as stopped:
-        assert "first offender: " in str(stopped) and (tmp_path / "nonfinite.pt").exists()
-        assert not math.isfinite(size) or size > 1e18
-        return
-    model = method.fitted()
-    assert all(p.isfinite().all() for p in model.parameters()) and 4 <= len(model.gaussians) <= 80
-    assert math.isfinite(size)

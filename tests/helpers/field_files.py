@@ -7,7 +7,6 @@ import numpy as np
 
 from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, pack_form
 
-COMMON = 6  # numbers before those of the form
 SIZES = {
     1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13), 2: (0, 1, 2, 7, 8, 9), 3: (0, 1, 2, 3, 4, 5), 4: (0, 1, 2, 3, 4),
 }  # fmt: skip

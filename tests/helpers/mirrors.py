@@ -53,6 +53,8 @@ def mirrored(patch) -> Iterator[Mirror]:
             waiting = mirror.answers[self.path]
             (waiting.pop(0) if waiting else sound)(self, mirror.files[self.path])
 
+        do_HEAD = do_GET
+
         def log_message(self, *_) -> None:
             return
 

@@ -146,19 +146,3 @@ def test_pictures_equal_those_of_the_definitions(backend, first):
             certain, pixels = certain + want.certain.sum(), pixels + want.certain.size
             lit += (want.transmittance < 0.99).sum()
     assert certain > 0.95 * pixels and lit > 0.05 * pixels
-
-
-@BACKENDS
-@FIRST
-def test_pictures_in_float32(backend, first):
-    """A few pixels of nasty fields lie where rounding the input moves them; not one Gaussian may be lost."""
-    off = pixels = 0
-    for number in range(first, first + TOGETHER, 5):
-        raster = drawn(number).rendered(backend, torch.float32)
-        for index, want in enumerate(wanted(number, 1e-3)):
-            image = raster.image if len(wanted(number, 1e-3)) == 1 else raster.image[index : index + 1]
-            assert torch.isfinite(image).all()
-            gaps = np.abs(image.double().numpy() - want.image).max((0, 1))
-            off += (want.certain & (gaps > 1e-3 * (1 + np.abs(want.image).max(initial=0)))).sum()
-            pixels += want.certain.sum()
-    assert off < 0.02 * pixels

@@ -137,7 +137,3 @@ def test_methods_without_deviations_say_so():
 def test_mistakes_are_said_with_their_array(wrong, said):
     with pytest.raises((DataError, ValueError), match=said):
         gsparc.fit(tx=END, **wrong)
-
-
-def test_few_names_are_public():
-    assert len(gsparc.__all__) <= 15 and all(getattr(gsparc, name) for name in gsparc.__all__)

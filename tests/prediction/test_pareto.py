@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.evaluation.drawing import style_of
-from gsparc.evaluation.experiment.tradeoff import beaten_by, draw_front
+from gsparc.evaluation.experiment.tradeoff import beaten_by
 from gsparc.prediction.pareto import Point, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
@@ -46,19 +45,3 @@ def test_a_point_that_another_method_beats_is_said():
     others = {"nearest": other(26.0, 0.5), "gp": other(29.0, 2.0), "mean": other(15.0, 0.1)}
     assert beaten_by(point, others, "psnr_db") == "nearest"
     assert beaten_by(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
-
-
-def test_settings_of_points_were_cut_at_the_edge_of_the_picture():
-    """Beside the axes; and baselines had the colour that is gsparc's elsewhere."""
-    said = worded({"keep": 0.12, "stride": 5, "confidence": False}) + ", 1 thread"
-    points = [Point(said, {}, 1, {"psnr_db": 30.0 + ms}, 20.0, np.full(3, float(ms))) for ms in range(1, 9)]
-    others = {"nearest": other(40.0, 0.5)}
-    figure = draw_front(points, range(8), others, "psnr_db", "gsparc", "a title")
-    figure.canvas.draw()
-    axes, legend = figure.axes
-    box = legend.texts[0].get_window_extent()
-    assert box.x0 >= 0 and box.x1 <= figure.bbox.x1 and 0 <= box.y0 <= box.y1 <= axes.bbox.y0
-    assert "nearest is better" in legend.texts[0].get_text()
-    assert {style_of(name).colour for name in ("gsparc", "nearest")} <= {
-        line.get_color() for line in axes.lines
-    }

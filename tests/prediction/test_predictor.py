@@ -58,17 +58,6 @@ def test_static_end_is_known_and_not_moved(spectra):
         predictor.spectrum(tx=world, rx=still + 1)
 
 
-def test_far_from_the_origin(campaign, folds, tmp_path):
-    near = campaign("spectrum", 40)
-    here = loaded(near, folds(40).folds[0], tmp_path)
-    shift = np.array([1e5, -2e5, 3e4])
-    predictor = gsparc.Predictor(
-        here.method, type(near.site)(**{**vars(near.site), "origin": near.site.origin + shift})
-    )
-    world = near.tx[:4] + near.site.origin
-    assert np.allclose(predictor.spectrum(tx=world + shift), here.spectrum(tx=world), atol=1e-5)
-
-
 def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_path):
     data = campaign("csi", 40, "tx")
     predictor = loaded(data, folds(40).folds[0], tmp_path, "nearest")

@@ -30,10 +30,15 @@ def test_wall_makes_an_image() -> None:
 
 
 def test_building_blocks_and_its_corner_diffracts() -> None:
-    streets = _street([[[8, -10], [12, 2]]], ground=0.0)
-    behind = trace_streets(streets, np.array([[20.0, 4.0, 5.0]]), 0.125)
-    assert streets.blocked(np.zeros((1, 2)), np.array([[20.0, 4.0]]))[0]
-    assert 0 < np.abs(behind.gain).max() < 0.5 * 0.125 / (4 * np.pi * 20)
+    """By Keller's coefficient of a half-plane, from the corner at (8, 2)."""
+    streets, user, corner = _street([[[8, -10], [12, 2]]], ground=0.0), np.array([16, 2.5]), np.array([8, 2])
+    behind = trace_streets(streets, np.array([[*user, 5.0]]), 0.125)
+    assert streets.blocked(np.zeros((1, 2)), user[None])[0]
+    near, far = np.linalg.norm(corner), np.linalg.norm(user - corner)
+    bend = np.arccos(corner @ (user - corner) / near / far)
+    keller = 1 / (2 * np.sqrt(2 * np.pi * 2 * np.pi / 0.125) * np.sin(bend / 2))
+    expected = 0.125 / (4 * np.pi) * keller / np.sqrt(near * far * (near + far))
+    assert np.isclose(np.abs(behind.gain).max(), expected, rtol=1e-2)
 
 
 def test_offsets_are_a_switch() -> None:

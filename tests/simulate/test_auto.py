@@ -126,16 +126,6 @@ def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
         assert (outside.sum(1) <= most).mean() < 1 - confidence + 0.01
 
 
-def test_prices_rank_sets():
-    full = PropagationEffects(depth=5)
-    assert (
-        auto.relative_cost(replace(full, depth=3), full)
-        < auto.relative_cost(full.without("diffuse"), full)
-        < 1
-    )
-    assert auto.relative_cost(full, full) == 1 and auto.relative_cost(full, full, 0.3) == pytest.approx(0.44)
-
-
 def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
     """By powers of another trace: of 3 of 128 outside."""
     choice = replace(decided("coverage +-1 dB"), effects=FULL)

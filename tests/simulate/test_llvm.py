@@ -36,10 +36,13 @@ def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
 
 
 @needs_sionna
-def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
+@pytest.mark.parametrize("fetch_missing", [False, True])
+def test_no_good_library_names_file_fault_and_remedy(monkeypatch, fetch_missing):
+    """One that the user names is replaced by no other."""
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
+    monkeypatch.setattr(llvm, "fetch_llvm", lambda: pytest.fail("another was fetched"))
     with pytest.raises(llvm.SimulatorMissing) as raised:
-        llvm.prepare_llvm()
+        llvm.prepare_llvm(fetch_missing)
     for words in ("/nowhere/libLLVM.so", "no such file", "python -m gsparc.simulate.llvm"):
         assert words in str(raised.value)
 

@@ -64,11 +64,6 @@ def test_lengths_are_read_as_osm_writes_them():
     }  # fmt: skip
 
 
-def test_one_building_suffices(tmp_path):
-    (tmp_path / "one.osm").write_text(extract())
-    assert len(read_town(tmp_path / "one.osm", 3.5e9).solids) == 2
-
-
 FAR = [(40.0, -30.0), (40.0, -29.0), (41.0, -29.0), (41.0, -30.0)]
 SPOILT = {
     "empty": "", "words": "a town", "html": "<html><body>503</body></html>", "cut": extract()[:-40],

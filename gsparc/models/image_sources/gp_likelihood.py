@@ -159,7 +159,7 @@ class Posterior:
 
     @cached_property
     def summed(self) -> CircularGains:
-        """Covariance of all sources, without noise until it is `condition`."""
+        """Covariance of all sources, without noise until `conditioned` adds it."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))

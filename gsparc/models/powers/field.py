@@ -25,7 +25,7 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_of_file
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
-from gsparc.models.powers.own_terms import UserTerm, describe_weights
+from gsparc.models.powers.own_terms import UserTerm, about_terms, describe_weights, less_means
 from gsparc.models.powers.settings import LAW_NEEDS, candidate_priors, choose_candidate, mix_candidates
 from gsparc.models.target_rows import entry_variance, from_real, power_rows
 from gsparc.processes.nearest import Nearest
@@ -94,15 +94,15 @@ class PowerField(ClosedForm):
     def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
-        more = tuple(UserTerm.of(one, site) for one in self.own_terms)
-        for one in more:  # once: a query has no time for it, nor has `torch.func`
-            one.check(torch.from_numpy(seen.places))
+        # Checked once: a query has no time for it, nor has `torch.func`.
+        more = tuple(UserTerm.of(one, site).about(torch.from_numpy(seen.places)) for one in self.own_terms)
         if self.walls is not None:
             walls = walls_of_file(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
             told = int((~seen.silent).sum()) >= LAW_NEEDS
-            law, notes = fit_site_law(seen, site) if told else (None, ())
-            trend = replace(trend_about_rows(seen, law), more=(walls, *more))
+            rest = less_means(seen, more)
+            law, notes = fit_site_law(rest, site) if told else (None, ())
+            trend = about_terms(rest, replace(trend_about_rows(rest, law), more=(walls,)), more)
             best = choose_candidate(seen, [(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -13,7 +14,16 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.processes.places import of_both_ends
 from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerRows
+from gsparc.processes.stored import MAIN
 from gsparc.processes.term import Columns
+from gsparc.processes.trend import Trend
+
+log = logging.getLogger(__name__)
+
+CERTAIN, TINY = 1e-9, 1e-12  # in place of a deviation [dB] and of a precision of 0
+POOLED_FROM = 6  # stations, from which on a weight of all as the prior of each predicts better
+LARGEST = 1e4  # of a column [deviations]: squares of larger ones hide the noise in a covariance
 
 
 def as_terms(terms: Any) -> tuple[Columns, ...]:
@@ -22,6 +32,9 @@ def as_terms(terms: Any) -> tuple[Columns, ...]:
     for one in result:
         if not isinstance(one, Columns):
             raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
+        if type(one).__module__ == MAIN:
+            said = "a saved model opens only where it is defined; move it to a file"
+            log.warning("model.terms: %s is of a notebook or script: %s", type(one).__name__, said)
     return result
 
 
@@ -33,20 +46,39 @@ class UserTerm(Columns):
         term: of a user.
         origin: (3,) of local coordinates [m].
         still: (3,) the end that stands, local [m]; NaN where unknown, or where both move.
+        middle: (Q,) mean columns of the rows, less which they are nearly independent of the level.
+        unit: deviation of the process [dB], which columns are relative to.
     """
 
     term: Columns
     origin: Tensor
     still: Tensor
+    middle: Tensor | float = 0.0
+    unit: float = 1.0
 
     @classmethod
-    def of(cls, term: Columns, site: Site) -> UserTerm:
+    def of(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
         still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
-        return cls(term, *(torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)))
+        places = [torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)]
+        return cls(term, places[0], places[1])
+
+    @property
+    def prior(self) -> tuple[float, float]:
+        """Mean [dB] and deviation [units] of each weight, of a column's unit."""
+        mean, deviation = self.term.prior_db or (0.0, self.unit)
+        return mean, deviation / self.unit
 
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`; of places of the moving end (n, 3), or of both (n, 6), in local coordinates."""
+        return self.prior[1] * (self._asked(places) - self.middle)
+
+    def mean(self, places: Tensor) -> Tensor:
+        """See `Columns`."""
+        mean, _ = self.prior
+        return mean * self._asked(places).sum(1) if mean else super().mean(places)
+
+    def _asked(self, places: Tensor) -> Tensor:
         both = places if of_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
         result = self.term.columns(both + torch.cat([self.origin, self.origin]))
         if not isinstance(result, Tensor):
@@ -54,26 +86,115 @@ class UserTerm(Columns):
             raise ValueError(f"{gave}; a torch tensor ({len(places)}, Q) is needed")
         return result
 
-    def check(self, places: Tensor) -> None:
-        """Raise `ValueError` where columns at places (n, D) [m] have another shape or are not finite."""
-        result = self.columns(places)
-        if result.ndim != 2 or len(result) != len(places) or not result.isfinite().all():
-            gave = f"{type(self.term).__name__}.columns gave {(*result.shape,)}"
+    def about(self, places: Tensor) -> Self:
+        """Return it centred at places (n, D) [m].
+
+        Raises:
+            ValueError: the prior is none, or columns cannot be used.
+        """
+        name, prior = type(self.term).__name__, self.term.prior_db
+        numbers = [0.0, 0.0] if prior is None else prior
+        if np.shape(numbers) != (2,) or not np.isfinite(numbers).all() or numbers[1] < 0:
+            raise ValueError(
+                f"{name}.prior_db={prior}: say [mean, deviation] of a weight in dB, such as [0, 3]"
+            )
+        result = self._asked(places)
+        gave = f"{name}.columns gave {(*result.shape,)}"
+        if result.ndim != 2 or len(result) != len(places):
+            raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed")
+        if wrong := int((~result.isfinite()).any(1).sum()):
             unknown = not of_both_ends(places) and not self.still.isfinite().all()
             why = ", but the place of the end that stands is not given" if unknown else ""
-            raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed{why}")
+            raise ValueError(f"{gave}, NaN or infinite in {wrong} rows; finite numbers are needed{why}")
+        if (most := float(result.abs().max())) * (1.0 if prior is None else prior[1]) > LARGEST:
+            raise ValueError(f"{gave} of up to {most:.2g}; divide them until most are between 0.1 and 10")
+        return replace(self, middle=result.mean(0))
 
 
-def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[str]:
+def less_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
+    """Return rows less what terms have as their mean."""
+    places = torch.from_numpy(rows.places)
+    return replace(rows, decibels=rows.decibels - sum(one.mean(places).numpy() for one in terms))
+
+
+def about_terms(rest: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
+    """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
+    heard = rest.heard
+    left = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
+    unit = float(left.std()) or 1.0
+    return in_unit_of(replace(trend, more=(*trend.more, *terms)), unit)
+
+
+def in_unit_of(trend: Trend, deviation: float) -> Trend:
+    """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
+    own = (replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more)
+    return replace(trend, more=tuple(own)) if trend.more else trend
+
+
+class LearnedWeights(str):
+    """A sentence on the weights of a term.
+
+    Attributes:
+        name: of the term.
+        numbers: (4, Q) their mean and deviation, and those before any row [dB of a column's unit].
+    """
+
+    name: str
+    numbers: np.ndarray
+
+    @classmethod
+    def of(cls, name: str, numbers: np.ndarray, rest: str = "") -> Self:
+        """Put them into words."""
+        said = ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in numbers[:2].T)
+        result = cls(f"{name}: {said}{rest}")
+        result.name, result.numbers = name, numbers
+        return result
+
+
+def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[LearnedWeights]:
     """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
     at = posterior.rows
     columns = posterior.prior.columns(at)
     weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude
     # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
     left = (scale * (1 - posterior.factor.whitened(columns).square().sum(0)).clamp_min(0)).sqrt()
+    numbers = torch.stack([weights, left, torch.zeros_like(left), torch.full_like(left, scale**0.5)]).numpy()
     sizes = [one.columns(at[:1]).shape[1] for one in own]
-    parts = (part[-sum(sizes) :].split(sizes) for part in (weights, left))
+    parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
+    kinds = [type(one.term).__name__ for one in own]
+    # Several of one kind are told apart by their order.
+    order = [kinds[: k + 1].count(kind) for k, kind in enumerate(kinds)]
+    names = [f"{kind} {n}" if kinds.count(kind) > 1 else kind for kind, n in zip(kinds, order, strict=True)]
     return [
-        f"{type(one.term).__name__}: " + ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in zip(*both, strict=True))
-        for one, *both in zip(own, *parts, strict=True)
+        LearnedWeights.of(name, one.prior[1] * part + [[one.prior[0]], [0]] * 2)
+        for name, one, part in zip(names, own, parts, strict=True)
     ]
+
+
+def over_stations(notes: Sequence[str]) -> dict[str, str]:
+    """Return, for what stations say of each term, one sentence: all of them together, and how they differ.
+
+    Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird, Controlled
+    Clinical Trials 7 (1986)).
+    """
+    found, result = [note for note in notes if isinstance(note, LearnedWeights)], dict[str, str]()
+    for key in {(one.name, one.numbers.shape): None for one in found}:
+        same = [one for one in found if (one.name, one.numbers.shape) == key]
+        means, deviation, before, wide = np.stack([one.numbers for one in same], 1)  # (S, Q) each
+        deviation, wide = np.maximum(deviation, CERTAIN), np.maximum(wide, CERTAIN)
+        # What rows say alone: the prior is taken out of each, and counts once.
+        precision = np.maximum(deviation**-2.0 - wide**-2.0, TINY)
+        told = (means / deviation**2 - before / wide**2) / precision
+        own, total = wide[0] ** -2.0, precision.sum(0)
+        centre = (precision * told).sum(0) / total
+        excess = (precision * (told - centre) ** 2).sum(0) - (len(same) - 1)
+        between = np.sqrt(np.maximum(excess / np.maximum(total - (precision**2).sum(0) / total, TINY), 0.0))
+        precision = 1 / (1 / precision + between**2)
+        both = own + precision.sum(0)
+        mean, error = (own * before[0] + (precision * told).sum(0)) / both, both**-0.5
+        rest = f" (of {len(same)} stations, which differ by {', '.join(f'{b:.2g}' for b in between)}"
+        if len(same) >= POOLED_FROM and len(mean) == 1:
+            rest += f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each of the others"
+        numbers = np.stack([mean, error, before[0], wide[0]])
+        result |= dict.fromkeys(same, LearnedWeights.of(key[0], numbers, f"{rest})" * (len(same) > 1)))
+    return result

@@ -20,6 +20,7 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
+from gsparc.models.powers.own_terms import UserTerm, about_terms, in_unit_of, less_means
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
 from gsparc.processes.density import LOOKS, Evidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
@@ -28,7 +29,6 @@ from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_near
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Posterior, Prior
-from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.processes.worker import out_of_time
 from gsparc.training.time_budget import Effort
@@ -84,8 +84,8 @@ class Candidate:
 
     @property
     def prior(self) -> Prior:
-        """Both."""
-        return Prior(self.kernel, self.trend)
+        """Both; deviations that terms have in decibels are relative to the kernel's."""
+        return Prior(self.kernel, in_unit_of(self.trend, math.sqrt(self.kernel.amplitude)))
 
     @property
     def description(self) -> str:
@@ -101,14 +101,15 @@ class Candidate:
 
 
 def candidate_priors(
-    rows: PowerRows, site: Site, seed: int, chosen_on: int, terms: tuple[Columns, ...] = ()
+    rows: PowerRows, site: Site, seed: int, chosen_on: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[Candidate]:
     """Return the likeliest settings of each mean law, the best first, then those of kriging.
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """
-    laws = _trends(rows, site, "auto")
-    trends = [(replace(trend, more=terms), cost, notes) for trend, cost, notes in laws]
+    rest = less_means(rows, terms)
+    laws = _trends(rest, site, "auto")
+    trends = [(about_terms(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, chosen_on)]
     found = sorted(

@@ -27,7 +27,6 @@ from gsparc.data.query import Query
 from gsparc.models import checkpoint
 from gsparc.models.terms import EffectSettings
 from gsparc.processes import powers
-from gsparc.processes.neighbourhood import Neighbourhood
 
 ROOT = Path(__file__).parents[3]
 SOURCES, EXAMPLES = ROOT / "ops" / "csrc" / "field", ROOT / "examples" / "c-library"
@@ -124,24 +123,6 @@ def test_more_members_than_the_library_holds_were_packed():
     for count, packs in ((7, True), (8, False)):
         many = replace(process, others=((0.1, replace(process, others=())),) * count)
         assert (make.powers_form(many, 1.0) is not None) == packs
-
-
-def test_trees_hold_every_row_and_boxes_those_below():
-    places = np.random.default_rng(0).uniform(size=(5000, 3))
-    order, sets, boxes = make.powers_form.__globals__["_trees"](Neighbourhood.of(places, 0), 30)
-    assert sorted(order) == list(range(5000)) and sets[:, 1].sum() == 30 and len(sets) == 2
-    boxes, first = boxes.reshape(-1, 2, 3), 0
-    for count, _, depth in sets:
-        nodes, own = boxes[: (2 << depth) - 1], places[order[first : first + count]]
-        for leaf in range(1 << depth):
-            inside = own[count * leaf >> depth : count * (leaf + 1) >> depth]
-            node = leaf + (1 << depth) - 1
-            while True:
-                assert (nodes[node, 0] <= inside).all() and (inside <= nodes[node, 1]).all()
-                if node == 0:
-                    break
-                node = (node - 1) // 2
-        boxes, first = boxes[(2 << depth) - 1 :], first + count
 
 
 def test_channels_without_sources_and_stations_are_refused_in_one_line():

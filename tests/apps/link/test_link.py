@@ -200,25 +200,6 @@ def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
 
 @needs_sionna
 @pytest.mark.slow
-def test_pusch_knows_who_knows_more() -> None:
-    draw = drawn()
-    torch.manual_seed(0)
-    true = draw(16, 1).expand(16, 48).contiguous()
-    error = draw(16, 48) * 0.6
-    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
-    pusch = Pusch("qpsk", 4, 30, known, iterations=8)
-    assert np.isclose(pusch.pilot_share, 2 / 14)
-    power = true.abs().square().mean(1, keepdim=True).sqrt()
-    band = Band(true, true + error * power, torch.full((16,), 0.36))
-    found = pusch.run(band, 3.0, np.arange(128) % 16, 64).groupby("receiver")
-    wrong, bits = found.failed.mean(), found.wrong.mean()
-    assert wrong["perfect"] <= wrong["lmmse"] + 0.05
-    assert wrong["predicted"] > wrong["perfect"] + 0.3
-    assert bits["perfect"] < bits["predicted"]
-
-
-@needs_sionna
-@pytest.mark.slow
 def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
     draw = drawn()
     torch.manual_seed(0)

@@ -26,12 +26,6 @@ def test_unknown_offset_is_integrated_out():
             assert found.size[i, j] == pytest.approx(float(torch.logdet(dense)), rel=1e-9)
 
 
-def test_device_offset_moves_no_place():
-    values, mean, variance = drawn(2, 30), drawn(6, 30), torch.ones(6, 30).double()
-    one, other = (level_misfit(v, mean, variance, 100.0).squared for v in (values, values + 7.0))
-    assert torch.allclose(one - one[:, :1], other - other[:, :1], atol=0.1)
-
-
 def test_missing_stations_change_nothing():
     values, mean, variance = drawn(2, 4), drawn(5, 4), drawn(5, 4).exp()
     values[:, 1] = torch.nan

@@ -12,6 +12,8 @@ from gsparc.apps.locate import locate
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import trust_state
 from gsparc.apps.locate.search import Nuisances
+from gsparc.apps.locate.snapshots import group_snapshots
+from gsparc.data.own import from_arrays
 from gsparc.models import checkpoint
 
 
@@ -53,6 +55,17 @@ def test_missing_and_silent_stations_are_no_values(tmp_path):
     assert quiet.area > loud.area, "below a level is less than at a level"
     linear = locate(predictor, 10 ** (power.astype(float) / 10), unit="linear")[0]
     assert np.allclose(linear.place, loud.place) and linear.area == loud.area
+
+
+def test_visits_of_a_place_are_snapshots_of_their_own():
+    """The second row of a station there is of the second snapshot, whichever order stations come in."""
+    place = np.repeat([[0.0, 0, 1], [5, 5, 1], [9, 0, 1]], [4, 2, 2], axis=0)
+    station, level = np.array([0, 1, 1, 0, 0, 1, 0, 1]), -50.0 - np.arange(8)
+    ends = {"station_position": np.array([[0.0, 9, 5], [9, 9, 5]]), "station": station}
+    data = from_arrays({"rx_position": place, "rssi_db": level, **ends})
+    values = group_snapshots(data, np.arange(8)).values.reshape(-1, 2)
+    heard = (values - values.max() - 50).round().int().tolist()
+    assert sorted(heard) == sorted([[-50, -51], [-53, -52], [-54, -55], [-56, -57]])
 
 
 @pytest.mark.parametrize("values, more, said", [

@@ -13,9 +13,7 @@ import gsparc
 from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.area import lay_grid
 from gsparc.apps.maps.floor_plan import read_floor_plan
-from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.errors import DataError
-from gsparc.data.links.georeference import Georeference
 
 SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 
@@ -30,25 +28,10 @@ def image(path):
     return path
 
 
-def test_a_rectangle_is_covered_by_square_cells():
-    grid = lay_grid(None, [0, 0, 4, 3], 1.5, 0.5)
-    assert grid.shape == (6, 8) and grid.inside.all() and grid.extent == (0.0, 4.0, 0.0, 3.0)
-    assert grid.places().shape == (48, 3) and (grid.places()[:, 2] == 1.5).all()
-    assert grid.places(np.array([8]))[0].tolist() == [0.25, 0.75, 1.5]
-
-
 def test_a_polygon_keeps_its_holes(tmp_path):
     grid = lay_grid(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
     assert grid.inside.sum() == 400 - 16
     assert not grid.inside[9, 9] and grid.inside[0, 0]
-
-
-def test_degrees_are_those_of_the_model(tmp_path):
-    origin = Georeference(47.0, 11.0)
-    square = [[[11.0, 47.0], [11.001, 47.0], [11.001, 47.001], [11.0, 47.001]]]
-    drawn, _ = read_shapes(geojson(tmp_path / "a.json", square), "area", origin)
-    low, high = drawn.bounds[:2], drawn.bounds[2:]
-    assert np.allclose(low, 0, atol=1e-6) and np.allclose(high, [76.06, 111.2], rtol=1e-3)
 
 
 def test_a_plan_lies_where_its_two_points_say(tmp_path):

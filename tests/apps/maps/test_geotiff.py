@@ -17,26 +17,6 @@ from gsparc.data.links.georeference import Georeference
 ORIGIN = Georeference(47.2, 11.3)
 
 
-def test_read_back_at_the_right_place(tmp_path):
-    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
-    from rasterio.warp import transform
-
-    found = predict_map(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
-    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
-    with rasterio.open(tmp_path / "map.tif") as file:
-        assert file.descriptions[0] == "power_db" and file.count == 11
-        named = file.tags(1 + file.descriptions.index("best_server"))
-        assert [named[str(i)] for i in range(len(found.stations))] == list(found.stations)
-        for row, column in ((0, 0), (14, 19), (7, 3)):
-            x, y = file.xy(len(found.grid.y) - 1 - row, column)
-            longitude, latitude = transform(file.crs, "EPSG:4326", [x], [y])
-            place = np.array([[found.grid.x[column], found.grid.y[row]]])
-            expected = ORIGIN.to_degrees(place)
-            assert np.allclose([latitude[0], longitude[0]], np.ravel(expected), atol=1e-7)
-            (value,) = next(file.sample([(x, y)], indexes=1))
-            assert value == pytest.approx(found.at_best_server(found.power_db)[row, column])
-
-
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     """Drawn in degrees with heights and a hole; rasterio masks the file's cells by the same polygon."""
     pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
@@ -54,6 +34,9 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     found = predict_map(predictor, tmp_path / "area.geojson", step_m=1.0)
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
+        assert file.descriptions[0] == "power_db" and file.count == 11
+        named = file.tags(1 + file.descriptions.index("best_server"))
+        assert [named[str(i)] for i in range(len(found.stations))] == list(found.stations)
         power = file.read(1)
         outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
     assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
@@ -70,15 +53,6 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
         plan_measurements(predictor, 3, walkable=tmp_path / "area.geojson")
     with pytest.raises(DataError, match="a rectangle is in metres"):
         predict_map(predictor, [11.3, 47.2, 11.301, 47.2008])
-
-
-def test_a_map_in_metres_has_no_projection(tmp_path):
-    rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
-    found = predict_map(gsparc.load(town_model()), [0, 0, 80, 60], step_m=4.0)
-    write_geotiff(tmp_path / "map.tif", found, None)
-    with rasterio.open(tmp_path / "map.tif") as file:
-        (value,) = next(file.sample([(found.grid.x[3], found.grid.y[5])], indexes=1))
-        assert file.crs is None and value == pytest.approx(found.at_best_server(found.power_db)[5, 3])
 
 
 def test_asked_for_without_rasterio(monkeypatch):

@@ -86,12 +86,12 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
     assert all(abs(part - 0.9) < 0.04 for part in (said.share, said.heard_share, said.silent_share))
 
 
-def test_too_little_evidence_promises_nothing():
-    with pytest.raises(ValueError, match="too few rows to test intervals"):
-        calibrate(evidence(LEAST_ROWS - 1))
-
-
 def test_distance_is_to_rows_of_the_same_station():
     known, station = np.array([[0.0, 0, 0], [10, 0, 0]]), np.array([0, 1])
     places = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
     assert nearest_distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]
+
+
+def test_too_little_evidence_promises_nothing():
+    with pytest.raises(ValueError, match="too few rows to test intervals"):
+        calibrate(evidence(LEAST_ROWS - 1))

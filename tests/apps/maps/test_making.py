@@ -1,7 +1,5 @@
 """A map is what the model predicts cell by cell, with its layers over stations."""
 
-import signal
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,16 +12,14 @@ from towns import MASTS, town_model
 
 import gsparc
 from gsparc.apps.maps.field_map import (
-    ARRAYS,
     REFUSED,
     best_server,
-    count_overlap,
     read_loads,
     server_chance,
     sinr,
 )
 from gsparc.apps.maps.intervals import Evidence
-from gsparc.apps.maps.making import _usual_levels, choose_stations, predict_levels, predict_map
+from gsparc.apps.maps.making import _usual_levels, choose_stations, predict_map
 from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.promised import map_notes
@@ -79,21 +75,6 @@ def test_chunks_do_not_change_a_map(predictor, monkeypatch):
     assert np.allclose(predict_map(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
-def test_an_interrupt_is_heeded_between_chunks(predictor, monkeypatch):
-    def slow(*given):
-        time.sleep(0.05)
-        return predict_levels(*given)
-
-    monkeypatch.setattr("gsparc.apps.maps.making.predict_levels", slow)
-    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 20)
-    began = time.perf_counter()
-    signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.2)
-    with pytest.raises(KeyboardInterrupt):
-        predict_map(predictor, step_m=1.0)
-    assert time.perf_counter() - began < 2
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["joblib", "ray"])
 def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
@@ -105,14 +86,6 @@ def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
         np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
 
 
-def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
-    found = predict_map(predictor, step_m=10.0, stations=["east", 0])
-    both = predict_map(predictor, step_m=10.0)
-    assert found.stations == ("east", "west")
-    assert np.array_equal(found.power_db[::-1], both.power_db)
-    assert predict_map(predictor, step_m=10.0, stations=["east"]).power_db.shape[0] == 1
-
-
 def test_ratio_of_signal_to_interference_by_hand():
     power = np.array([[-50.0, np.nan, np.nan], [-60.0, -60.0, np.nan]])
     assert sinr(power, np.array([1.0, 1.0]), None)[0] == pytest.approx(10)
@@ -122,13 +95,6 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
     assert best_server(power).tolist() == [0, 1, REFUSED]
     assert read_loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
-
-
-def test_ratio_and_overlap_are_within_one_carrier():
-    power = np.array([[-50.0, -90.0], [-52.0, -60.0], [-54.0, -61.0], [-57.0, np.nan]])
-    carrier = np.array([0, 1, 0, 0])
-    assert count_overlap(power, carrier).tolist() == [2, 1]
-    assert count_overlap(power, carrier * 0).tolist() == [3, 2]
 
 
 def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
@@ -201,16 +167,6 @@ def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
     usual, floor = _usual_levels(promise, [0, 1], None)
     assert floor == pytest.approx([-99.5, -90]) and usual[0] == pytest.approx([-75, 14.58], abs=0.01)
     assert _usual_levels(None, [0, 1], -95.0)[1].tolist() == [-95, -95]
-
-
-def test_saved_whole(predictor, tmp_path):
-    made = predict_map(predictor, [0, 0, 80, 60], step_m=8.0)
-    made.save(tmp_path / "map.npz")
-    with np.load(tmp_path / "map.npz") as found:
-        for name in ARRAYS:
-            np.testing.assert_array_equal(found[name], getattr(made, name))
-        assert found["stations"].tolist() == ["west", "east"] and str(found["unit"]) == made.unit
-    assert made.figures()["map/cells"] == made.grid.inside.sum()
 
 
 def test_spectra_have_no_power(predictor, monkeypatch):

@@ -2,20 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from gsparc.apps.view.answer import Answer, Rays, merge_paths, predict_answer
 from gsparc.apps.view.building import BOX, MIRROR, ray_parts
-from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html
+from gsparc.apps.view.reasons import explain_level, legend_html
 from gsparc.apps.view.scene import Faces
 
 HERE = np.zeros(3)
-
-
-def test_how_far_the_other_end_and_measurements_are():
-    answer = Answer({"rx": np.array([10.0, 0, 0]), "tx": np.array([-10.0, 0, 0])}, level_db=-75.0)
-    said = explain_level(answer, "rx", cKDTree([[10.0, 3, 0], [0, 0, 0]]))
-    assert said == ["20 m from the other end", "nearest measurement: 3 m away"]
 
 
 def test_a_fade_is_said_to_be_one():
@@ -56,11 +49,6 @@ def test_rays_are_as_long_as_their_delays():
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)
-
-
-def test_nought_has_no_sign():
-    said = answer_markdown(Answer({"rx": np.array([-0.001, 0.0, -1.0])}, level_db=-50.0), ["rx"], [])
-    assert "receiver at 0.00, 0.00, -1.00 m" in said
 
 
 def test_what_surfaces_are_is_said_once_of_each_colour():

@@ -57,24 +57,6 @@ def test_order(work, first, then, order):
     assert done == order
 
 
-def test_a_forgotten_client_costs_nothing_more(work):
-    steps, begun = [], threading.Event()
-
-    def endless():
-        while True:
-            steps.append(1)
-            begun.set()
-            yield
-
-    work.ask((7, "plane"), endless)
-    assert begun.wait(5)
-    work.forget(7)
-    settle(work)
-    count = len(steps)
-    time.sleep(0.05)
-    assert len(steps) <= count + 1
-
-
 def test_a_job_that_fails_does_not_end_the_others(work, caplog):
     done = []
 

@@ -29,6 +29,7 @@ def read_back(content: bytes) -> dict[str, np.ndarray]:
 
 def test_every_field_says_what_a_splat_viewer_takes_it_for(tmp_path):
     made = cloud()
+    made.opacities[:2] = [0, 1]
     colours = np.random.default_rng(1).integers(0, 256, (5, 3)).astype(np.uint8)
     write_ply(tmp_path / "a.ply", made, colours)
     found = read_back((tmp_path / "a.ply").read_bytes())
@@ -36,18 +37,12 @@ def test_every_field_says_what_a_splat_viewer_takes_it_for(tmp_path):
     np.testing.assert_allclose(np.column_stack([found[k] for k in "xyz"]), made.means, rtol=1e-6)
     scales = np.exp(np.column_stack([found[f"scale_{k}"] for k in range(3)]))
     np.testing.assert_allclose(scales, made.scales, rtol=1e-5)
-    np.testing.assert_allclose(1 / (1 + np.exp(-found["opacity"])), made.opacities, rtol=1e-5)
+    assert np.isfinite(found["opacity"]).all()
+    np.testing.assert_allclose(1 / (1 + np.exp(-found["opacity"])), made.opacities, rtol=1e-5, atol=1e-4)
     rgb = 0.5 + Y00 * np.column_stack([found[f"f_dc_{k}"] for k in range(3)])
     np.testing.assert_allclose(rgb, colours / 255, atol=1e-6)
     turns = np.column_stack([found[f"rot_{k}"] for k in range(4)])
     np.testing.assert_allclose(turns, made.quats, atol=1e-6)
-
-
-def test_opacities_of_nought_and_one_stay_finite(tmp_path):
-    made = cloud(2)
-    made.opacities[:] = [0, 1]
-    write_ply(tmp_path / "a.ply", made, np.zeros((2, 3), np.uint8))
-    assert np.isfinite(read_back((tmp_path / "a.ply").read_bytes())["opacity"]).all()
 
 
 def test_none_and_what_is_not_finite_are_refused(tmp_path):

@@ -16,11 +16,6 @@ def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
     np.testing.assert_allclose(frame.to_world(drawn), places, atol=1e-3)
 
 
-def test_one_place_is_a_site_too():
-    frame = Frame.around(np.zeros((1, 3)))
-    assert np.isfinite(frame.to_drawn(np.ones((2, 3)))).all()
-
-
 def test_values_that_are_not_known_are_grey():
     legend = Legend.over("level", np.array([np.nan, 0.0, 1.0, np.inf]))
     found = legend.of(np.array([np.nan, 0.0, 1.0, 5.0]))
@@ -36,8 +31,3 @@ def test_a_floor_plan_and_the_grid_lie_beneath_the_plane(power_view):
     low = viewed.heights()[0]
     scene = build_scene(viewed, plan, "west", None)
     assert scene.ground < scene.part("floor plan").corner[2] < low <= power_view.grid.height
-
-
-def test_heights_of_a_plane_are_whole_centimetres(power_view):
-    low, high = power_view.viewed.heights()
-    assert (round(low, 2), round(high, 2)) == (low, high) and low <= power_view.grid.height <= high

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from campaigns import spectra
 from towns import trained
 
 from gsparc.apps.view.site_view import SiteView, plane_grid
@@ -123,14 +122,6 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     assert "emi" in session.legend.content
     session._show_part("gaussians", False)
     assert not session.nodes["gaussians"].visible and "emi" not in session.legend.content
-
-
-def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
-    session = visit(SiteView(open_model(trained(spectra(tmp_path / "rx.npz", moving="rx"), "idw"))))
-    drag(session, "rx", [0.2, 0.1, -0.3])
-    settle(session)
-    where = session.scene.frame.to_world(session.nodes["sphere"].position)
-    np.testing.assert_allclose(where, [0.2, 0.1, -0.3], atol=1e-5)
 
 
 def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared import run_lock
-from gsparc.commands.shared.run_lock import HOLDER, LOCK, InUse, RunLock, hold_folder, locked, release_folders
+from gsparc.commands.shared.run_lock import HOLDER, LOCK, RunLock, hold_folder, locked, release_folders
 from gsparc.commands.train import LEFT, train
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import read_run
@@ -56,15 +56,6 @@ def test_training_from_python_took_no_lock(other, tmp_path):
     hold_folder(tmp_path)  # as a command does before it trains
     with locked(tmp_path):
         pass
-    release_folders()
-
-
-def test_a_released_folder_is_free(tmp_path):
-    hold_folder(tmp_path)
-    release_folders()
-    hold_folder(tmp_path)
-    with pytest.raises(InUse, match=r"another run writes here \(process \d+ on "):
-        hold_folder(tmp_path)
     release_folders()
 
 

@@ -72,12 +72,6 @@ def test_table_is_read(tmp_path):
             read_fingerprints(file)
 
 
-@pytest.mark.parametrize("name", ["none.npz", "none.csv"])
-def test_missing_file_is_refused(tmp_path, name):
-    with pytest.raises(DataError, match=r"[Nn]o such file"):
-        read_fingerprints(tmp_path / name)
-
-
 def invented(count: int = 200) -> Fingerprints:
     rng = np.random.default_rng(0)
     none, places = np.zeros(count, np.int64), rng.uniform(0, 20, (count, 3))

@@ -186,6 +186,8 @@ def test_powder_table_is_what_was_converted_from_it():
     assert np.array_equal(released["latitude"], converted["latitude"][::8])
     same = np.isclose(released["rssi_db"], converted["rssi_db"][::8][:, shared], atol=1e-4, equal_nan=True)
     assert same.all()
+    for axis in ("latitude", "longitude"):
+        assert np.allclose(released[f"station_{axis}"], converted[f"station_{axis}"][shared], atol=1e-7)
 
 
 class PositionerValue:

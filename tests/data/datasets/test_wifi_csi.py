@@ -77,15 +77,19 @@ def test_packets_of_an_intel_5300_along_a_track(robot):
     assert np.ptp(plain["time_s"]) == pytest.approx(np.ptp(raw["time_s"]), abs=0.01)
 
 
-def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
-    rng = np.random.default_rng(0)
-    parts = rng.integers(20, 90, (5, 128))
-    parts[:, 20:22] = 0  # subcarrier 10
+def esp32(folder: Path, parts: np.ndarray) -> Path:
+    """The log of packets at one place, of their real and imaginary parts (packets, 128)."""
     head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
     lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
-    (tmp_path / "walk.csv").write_text("".join(lines))
-    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
-    raw = read_wifi_csi(tmp_path).arrays
+    (folder / "walk.csv").write_text("".join(lines))
+    (folder / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
+    return folder
+
+
+def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
+    parts = np.random.default_rng(0).integers(20, 90, (5, 128))
+    parts[:, 20:22] = 0  # subcarrier 10
+    raw = read_wifi_csi(esp32(tmp_path, parts)).arrays
     assert raw["frequency_hz"].mean() == pytest.approx(2.437e9, abs=SPACING_HZ)
     tone = ((raw["frequency_hz"] - 2.437e9) / SPACING_HZ).round()
     assert len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
@@ -94,11 +98,7 @@ def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
 def test_a_packet_of_zeros_made_all_levels_nan(tmp_path, caplog):
     parts = np.random.default_rng(0).integers(20, 90, (5, 128))
     parts[2] = 0
-    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
-    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
-    (tmp_path / "walk.csv").write_text("".join(lines))
-    (tmp_path / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
-    raw = read_wifi_csi(tmp_path).arrays
+    raw = read_wifi_csi(esp32(tmp_path, parts)).arrays
     assert len(raw["csi"]) == 4 and np.isfinite(raw["csi"]).all() and "1 packets" in caplog.text
 
 

@@ -57,7 +57,7 @@ def records(csi, tick, time, number, sender) -> bytes:
 
 
 def drive(
-    folder: Path, name: str = "t1", packets: int = 900, lost: slice = slice(0, 0), seed: int = 0
+    folder: Path, name: str = "t1", packets: int = 600, lost: slice = slice(0, 0), seed: int = 0
 ) -> np.ndarray:
     """Logs of a robot that drives .6 m before three transmitters, with oscillators of their own; returns its way."""
     rng = np.random.default_rng(seed)
@@ -120,7 +120,7 @@ def test_the_channel_comes_back_up_to_a_factor_for_each_run(tmp_path):
 
 
 def test_a_gap_begins_a_run(tmp_path):
-    drive(tmp_path, lost=slice(300, 330))  # 2 cm without a packet
+    drive(tmp_path, lost=slice(300, 330))  # 3 cm without a packet
     assert set(read_wsr(tmp_path, spacing_m=0.02).arrays["run"]) == {
         f"t1 {tx} {part}" for tx in LOS_SET_A for part in (0, 1)
     }

@@ -47,14 +47,6 @@ def test_a_wide_file_is_a_row_for_each_link():
     )
 
 
-def test_a_long_file_is_the_same_measurements():
-    one, other = read(town(**LONG, rssi_db=LEVELS.reshape(-1))).data, read(town()).data
-    np.testing.assert_array_equal(one.station, other.station)
-    np.testing.assert_array_equal(one.target, other.target)
-    first = np.unique(one.place, return_index=True)[1]
-    assert len(first) == PLACES
-
-
 def test_three_access_points_by_their_positions_alone():
     """One end at three places was refused: both ends move."""
     rows = 60
@@ -110,17 +102,10 @@ def test_the_mask_wins_over_the_sensitivity():
     assert read(town(rssi_db=holes, mask=mask, sensitivity_db=-80.0)).data.censored is None
 
 
-def test_a_station_at_two_carriers_is_two():
-    carriers = np.repeat([4.6e8, 3.5e9], PLACES // 2)
-    data = read(town(carrier_hz=carriers)).data
-    assert len(data.site.stations) == 2 * STATIONS
-    assert data.site.stations.name[:2] == ("north at 460 MHz", "north at 3500 MHz")
-    assert data.site.stations.carrier_hz[data.station[-1]] == 3.5e9
-
-
 def test_the_files_own_split_names_rows_of_the_file():
     data = read(town(split_train=np.arange(8), split_test=np.array([8, 9]))).data
     np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
+    assert data.subset(np.arange(6)).release_split is None  # its rows are numbered otherwise
 
 
 def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
@@ -222,6 +207,8 @@ def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers()
     carriers = np.where(np.arange(PLACES) % 2, 1e9, 2e9)
     data = read(town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))).data
     assert len(data.site.stations) == 2 * STATIONS and data.censored.any()
+    assert data.site.stations.name[:2] == ("north at 1000 MHz", "north at 2000 MHz")
+    assert data.site.stations.carrier_hz[data.station[-1]] == 1e9
     level_db = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
     expected = [{"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station]
     np.testing.assert_allclose(level_db[data.censored > 0], np.array(expected)[data.censored > 0], atol=1e-3)

@@ -32,8 +32,9 @@ def links(data: Measurements) -> list[tuple[str, float]]:
     return [(names[t], round(float(v), 3)) for t, v in zip(data.station, level, strict=True)]
 
 
-def test_rows_after_a_step_are_another_stations():
-    parts = links(parted(wide(), {"b": (5, 8)}))
+@pytest.mark.parametrize("who", ["b", "1"])
+def test_rows_after_a_step_are_another_stations(who):
+    parts = links(parted(wide(), {who: (5, 8)}))
     names = [name for name, _ in parts]
     assert [names.count(n) for n in ("a", "b", "b from row 5", "b from row 8")] == [12, 4, 3, 4]
     assert sorted(v for _, v in parts) == sorted(v for _, v in links(parted(wide(), {})))
@@ -56,11 +57,6 @@ def test_rows_of_a_long_file_and_its_parts_by_the_stations_name():
     assert kept.site.stations.name == ("b", "b from row 6") and kept.station.tolist() == [0, 0, 0, 1, 1, 1]
 
 
-def test_places_of_a_row_are_held_out_together_as_before():
-    before, after = parted(wide(), {}), parted(wide(), {"b": (5,)})
-    assert np.array_equal(before.place, after.place) and len(before) == len(after)
-
-
 def unplaced() -> Raw:
     return Raw({"rx_position": np.eye(4)[:, :3], "tx_position": np.ones(3), "rssi_db": np.zeros(4)})
 
@@ -73,8 +69,3 @@ def unplaced() -> Raw:
 ])  # fmt: skip
 def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
     refused(says, parted, make(), steps)
-
-
-def test_a_station_with_a_name_was_unknown_by_its_number():
-    by_name, by_number = (parted(wide(), {who: (5,)}).site.stations.name for who in ("b", "1"))
-    assert by_name == by_number

@@ -174,23 +174,6 @@ def test_what_is_named_changes_no_bit_of_the_answers(case, option):
     assert torch.equal(*perturbed(case, option))
 
 
-@pytest.mark.parametrize(
-    "case, option",
-    [
-        (plain_case("array", "idw"), "model.power"),
-        (plain_case("power", "nearest"), "split.thin"),
-        (plain_case("image", "gp"), "model.components"),
-        (FAST[1], "model.optimizer.emission"),
-        (FAST[1], "model.field.count"),
-    ],
-    ids=name_of,
-)
-def test_what_is_heeded_changes_the_answers(case, option):
-    assert option not in case[3]
-    first, second = perturbed(case, option)
-    assert first.shape != second.shape or not torch.equal(first, second)
-
-
 def warned(caplog) -> list[str]:
     return [one.message for one in caplog.records if "without effect" in one.message]
 
@@ -205,12 +188,23 @@ def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
     assert torch.equal(answers, fitted("power", "model=gsparc")[1])
 
 
-def test_steps_mean_nothing_to_a_plain_method(caplog):
-    """`trainer.max_steps=1200` of a plain method; what nobody gave is not named."""
-    assert fitted("image", "model=nearest", "trainer.max_steps=1200")[0] == {"trainer.max_steps"}
-    assert warned(caplog)[0].endswith("(nearest takes no gradient steps here: model=splat does)")
-    caplog.clear()
-    assert not fitted("image", "model=nearest", "seed=1")[0] and not warned(caplog)
+@pytest.mark.parametrize(("world", "options", "unused", "said"), [
+    ("image", "model=nearest trainer.max_steps=1200", {"trainer.max_steps"},
+     "(nearest takes no gradient steps here: model=splat does)"),
+    ("image", "model=nearest seed=1", set(), ""),
+    ("power", "model=gsparc model.steps=7", {"model.steps"},
+     "model.steps=7 (gsparc takes no gradient steps here: model=splat does)"),
+    ("power", "model=gsparc init=vectors", {"init"}, "init=vectors (here it is init=powers)"),
+    ("array", "model=gsparc init=vectors model.steps=0", set(), ""),
+    ("array", "model=gsparc init=auto model.effects.array=true model.steps=0", set(), ""),
+    ("power", "model=gsparc model.effects.phase=false", {"model.effects.phase"}, ""),
+    ("image", "model=gsparc model.effects.residual=false trainer.max_steps=1", set(), ""),
+    ("tone", "model=splat model.field.count=20 model.steps=3", set(), ""),
+    ("tone", "model=splat model.field.count=20 model.steps=3 trainer.max_steps=2", {"model.steps"}, ""),
+])  # fmt: skip
+def test_what_decides_nothing_here_is_named_with_why(world, options, unused, said, caplog):
+    assert fitted(world, *options.split())[0] == unused
+    assert [line.endswith(said) for line in warned(caplog)] == [True] * bool(unused)
 
 
 def test_hidden_units_beside_a_process_with_all_the_weight(caplog):
@@ -229,31 +223,6 @@ def test_callbacks_of_a_training_without_steps(none, caplog):
     unused, _ = fitted("array", "model=gsparc", none, *given)
     assert unused == {"callbacks.densify.start", "callbacks", "trainer.max_time"}
     assert warned(caplog)[0].endswith("(no gradient steps are asked for: say model.steps=auto)")
-
-
-def test_steps_that_closed_forms_do_not_take(caplog):
-    assert fitted("power", "model=gsparc", "model.steps=7")[0] == {"model.steps"}
-    assert warned(caplog)[0].endswith("model.steps=7 (gsparc takes no gradient steps here: model=splat does)")
-
-
-def test_an_initialiser_that_these_data_do_not_have(caplog):
-    """`init=vectors` of powers was ignored without a word."""
-    assert fitted("power", "model=gsparc", "init=vectors")[0] == {"init"}
-    assert warned(caplog)[0].endswith("init=vectors (here it is init=powers)")
-    for init in ("vectors", "auto"):
-        assert not fitted("array", "model=gsparc", f"init={init}", "model.steps=0")[0]
-
-
-def test_switches_of_effects_count_where_they_decide():
-    assert fitted("power", "model=gsparc", "model.effects.phase=false")[0] == {"model.effects.phase"}
-    assert not fitted("array", "model=gsparc", "model.effects.array=true", "model.steps=0")[0]
-    assert not fitted("image", "model=gsparc", "model.effects.residual=false", "trainer.max_steps=1")[0]
-
-
-def test_steps_of_the_model_give_way_to_those_of_the_trainer():
-    given = "model=splat", "model.field.count=20", "model.steps=3"
-    assert not fitted("tone", *given)[0]
-    assert fitted("tone", *given, "trainer.max_steps=2")[0] == {"model.steps"}
 
 
 def test_phases_of_snapshots_mean_nothing_to_powers():

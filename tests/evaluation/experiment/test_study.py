@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-import numpy as np
 import pytest
 from clocks import WoundClock
 from invented import divide, invent
@@ -10,7 +9,6 @@ from invented import divide, invent
 from gsparc.data.query import Batch
 from gsparc.evaluation.experiment import study
 from gsparc.evaluation.experiment.done import State
-from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.experiment.study import DataChanges, Study
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
@@ -117,14 +115,3 @@ def test_more_measurements_are_better_and_are_counted(run):
     assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1
     with pytest.raises(ValueError, match="keep="):
         DataChanges("", keep=[0.0])
-
-
-def test_folds_are_pooled_and_each_fit_is_handed_on(tmp_path):
-    data, split = invent("csi"), divide(48, 3)
-    kept = []
-    contexts = fold_contexts(FitContext(tmp_path), split)
-    fits = fit_folds(Nearest(), data, split, contexts, keep=lambda *given: kept.append(given))
-    assert fits.figures == {} and np.isfinite(fits.train_cpu_s).all()
-    found = fits.with_scores(data, split)
-    assert [number for number, _, _ in kept] == [0, 1, 2] and len(found.train_s) == len(found.methods) == 3
-    assert found.figures["samples"] == 48

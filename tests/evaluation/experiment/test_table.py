@@ -125,15 +125,6 @@ def test_what_an_earlier_program_measured_is_said():
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
 
-def test_page_sheet_and_picture_show_every_method(tmp_path):
-    found = average_cells(FOUND, TIMED)
-    page = markdown(split_by_problem(found), "gsparc")
-    assert "### rfid, split random, 60 s of training per model" in page
-    assert "**29.50 ± 0.71**" in page and "| gsrf | 21.00 ± 1.41 | 0.9 |" in page
-    draw_budgets(found, tmp_path / "compare.png", "gsparc")
-    assert (tmp_path / "compare.png").stat().st_size > 10_000
-
-
 def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
     found = [filled("gp", 30.0, i, 60.0, **{"model/label": label}) for i, label in enumerate(labels)]

@@ -23,8 +23,6 @@ def invent(
     effects: str = "none",
     overrides: tuple[str, ...] = (),
     train: int = 100,
-    curve: bool = True,
-    picture: bool = True,
 ) -> Path:
     """A run of spectra whose samples scatter about `psnr`."""
     folder.mkdir(parents=True)
@@ -57,15 +55,7 @@ def invent(
         "baseline/mean/psnr_db": 15.0, "baseline/mean/render_ms_p50": 0.03, "baseline/mean/train_s": 0.001,
     }  # fmt: skip
     (folder / "summary.json").write_text(json.dumps(facts))
-    if curve:
-        steps = np.arange(1, 6)
-        _csv(folder / "learning_curve.csv", {
-            "step": steps, "seconds": steps * seconds / 5, "num_gaussians": [500] * 5,
-            "train/task_loss": 1 / steps, "val/ssim_gauss": [0.9] * 5, "val/psnr_db": psnr - 5 / steps,
-            "val/mse": [""] * 5,
-        })  # fmt: skip
-    if picture:
-        Image.fromarray((255 * draw.random((40, 60, 3))).astype(np.uint8)).save(folder / "test.png")
+    Image.fromarray((255 * draw.random((40, 60, 3))).astype(np.uint8)).save(folder / "test.png")
     if overrides:
         (folder / ".hydra").mkdir()
         (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
@@ -98,7 +88,6 @@ def invent_three(folder: Path) -> list[Path]:
             seconds=130,
             ms=0.2,
             effects="array",
-            curve=False,
             overrides=other,
             train=50,
         ),

@@ -1,7 +1,6 @@
 """The page holds everything itself, opens in a browser, sorts, and is legible on a phone."""
 
 import re
-from xml.etree import ElementTree
 
 import pytest
 from campaigns import compose, runs_in
@@ -56,15 +55,6 @@ def test_what_a_run_is_called_cannot_become_a_script(run_dir, tmp_path):
     assert "<script>alert" not in text and "<b>" not in text
 
 
-def test_every_plot_is_a_whole_drawing(three):
-    runs = find_runs(three)
-    for draw in (plots.draw_pareto, plots.draw_accuracy_cdf):
-        figure = draw(runs)
-        assert ElementTree.fromstring(plots.to_svg(figure)).tag.endswith("svg")
-        title = figure.get_label()
-        assert title and title not in plots.to_svg(figure)
-
-
 def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
     """And in another plot it had the colour of another method."""
     for name in ("gsparc", "gp"):
@@ -74,14 +64,6 @@ def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
     assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
     colours = {to_hex(one.get_color()).upper() for one in axes.lines if one.get_label() in ("gsparc", "gp")}
     assert colours == {style_of(name).colour for name in ("gsparc", "gp")}
-
-
-def test_a_busy_machine_is_said_once(three):
-    runs = find_runs(three)
-    for load, run in zip((1.5, 3.0, 0.2), runs, strict=True):
-        run.facts["machine/load"] = load
-    said = [text for text in warnings(runs) if "busy" in text]
-    assert said == ["the machine was busy (load 0.2 to 3.0 per core): times are inflated, ratios less so"]
 
 
 @pytest.mark.slow

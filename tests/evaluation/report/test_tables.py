@@ -9,9 +9,8 @@ import pytest
 from rich.console import Console
 
 from gsparc.evaluation.report import tables
-from gsparc.evaluation.report.plots import shorten_setting
-from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs, read_columns
-from gsparc.evaluation.report.tables import bootstrap_interval, interval_of_figure
+from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs
+from gsparc.evaluation.report.tables import bootstrap_interval
 from gsparc.evaluation.table import Column, Interval, Table
 
 
@@ -73,12 +72,6 @@ def test_an_interval_covers_as_often_as_it_says():
     assert 86 <= hits <= 100
 
 
-def test_an_interval_of_a_ratio_weighs_samples(three):
-    low, high = bootstrap_interval(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
-    assert low == high == pytest.approx(0.1)
-    assert interval_of_figure(find_runs(three)[0].row, "no_such_figure") is None
-
-
 def test_the_worst_receivers_are_the_worst(three):
     runs = find_runs(three[:1])
     table = tables.table_of_worst(runs)
@@ -97,26 +90,10 @@ def test_a_table_survives_csv_and_markdown():
     assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | - | - |" in text and "note" in text
 
 
-def test_columns_keep_text_as_text(tmp_path):
-    (tmp_path / "x.csv").write_text("a,b\n1,x\n,y\n")
-    found = read_columns(tmp_path / "x.csv")
-    assert np.isnan(found["a"][1]) and found["b"].tolist() == ["x", "y"]
-    assert read_columns(tmp_path / "none.csv") == {}
-
-
 def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
     assert [run.row["query_ms"] for run in find_runs(three[:2])] == [0.1, 0.5]
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
-
-
-def test_labels_keep_the_value_that_tells_settings_apart():
-    """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
-    said = [
-        shorten_setting(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)
-    ]
-    assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
-    assert shorten_setting("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and shorten_setting("gp") == "gp"
 
 
 def test_labels_of_sweeps_lost_true_and_false_on_the_console():

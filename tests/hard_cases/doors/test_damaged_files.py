@@ -5,8 +5,6 @@ bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhd
 """
 
 import random
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -62,22 +60,12 @@ def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
         load_own(path)
 
 
-def test_ours_need_no_trial(tmp_path, monkeypatch):
-    from gsparc.data.own import write_own
-
-    with h5py.File(users_file(tmp_path / "mine.h5")) as file:
-        arrays = {k: file[k][()] for k in ("rx_position", "tx_position", "csi", "frequency_hz")}
-    write_own(tmp_path / "ours.h5", {**arrays, "row_name": np.array(["a"] * 12)}, {"name": "garage"})
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail(f"{sys.executable} was started"))
-    assert len(load_own(tmp_path / "ours.h5")) == 12
-
-
 def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     """Found by fuzzing: an object that says it is 2 kB larger is walked past for ever."""
     spoilt = bytearray(users_file(tmp_path / "good.h5").read_bytes())
     spoilt[spoilt.index(raw_files.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(raw_files.hdf5_text_error, "__defaults__", (3.0,))
-    with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 3 s\)"):
+    monkeypatch.setattr(raw_files.hdf5_text_error, "__defaults__", (1.0,))
+    with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 1 s\)"):
         load_own(path)

@@ -90,16 +90,6 @@ def test_a_mirror_is_found_where_it_is(scenario):
     np.testing.assert_allclose(arrives[:, 1], towards(PLACES, point), atol=1e-4)
 
 
-def test_models_without_paths_are_refused(tmp_path):
-    class Waves(Mirror):
-        def paths(self, rx):
-            raise ValueError("paths: none")
-
-    with pytest.raises(ValueError, match="paths: none"):
-        deepmimo.write_scenario(tmp_path, Waves(), PLACES)
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_package_of_that_name_reads_it(tmp_path, monkeypatch):
     package = pytest.importorskip("deepmimo", reason="deepmimo 4 is not installed")
     folder = tmp_path / "deepmimo_scenarios" / "mirror"

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from campaigns import compose
 from scipy.interpolate import CubicSpline
 
@@ -84,11 +83,6 @@ def test_doppler_is_that_of_the_motion():
     assert line.doppler_hz()[0, loudest] == pytest.approx(expected, rel=0.15)
 
 
-def test_residual_is_stated_and_falls_with_taps():
-    found = [fit_taps(Rays(TONES), drive(length=0.1), taps).residual for taps in (1, 4, 8, 32)]
-    assert found[0] > found[1] > found[2] > found[3] and found[0] > 0.05
-
-
 @pytest.mark.parametrize("said, tones, length, rate_hz", [
     ("each later than the one before", TONES, 0.0, None),
     ("rate_hz= is needed", TONES[:1], 0.5, None),
@@ -122,32 +116,3 @@ def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch)
     with pytest.raises(ValueError, match="no column time_s"):
         run(*common[:2], f"table={tmp_path}/still.csv", f"out={tmp_path}/other")
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.slow
-def test_a_link_over_exported_taps_is_the_link_study():
-    """The same blocks in the same noise: over the model's channels, as `gsparc link`, and over its taps."""
-    sionna = pytest.importorskip("sionna.phy", reason="the extra `sionna` is not installed")
-    from gsparc.apps.link.adaptation import Band
-    from gsparc.apps.link.pusch import Pusch
-
-    tones = CARRIER + 30e3 * (np.arange(48) - 23.5)
-    ray, way = Rays(tones, True), drive()
-    line, begin = fit_taps(ray, way, 32, 30.72e6), np.random.default_rng(3).uniform(0, 1, 32) * 0.5
-    delay = (line.first + np.arange(32)) / line.rate_hz
-    taps = CubicSpline(line.time_s, line.gain)(begin)[:, 0]  # still while a slot lasts
-    summed = taps @ np.exp(-2j * np.pi * np.outer(delay, tones - CARRIER))
-    exported = torch.from_numpy(summed.astype(np.complex64))
-    study = torch.from_numpy(ray.csi(rx=way.at(begin))[:, 0].astype(np.complex64))
-    assert (exported - study).abs().square().mean() < 1e-5 * study.abs().square().mean()
-    pusch = Pusch("qpsk", 4, 30, np.ones(48, complex), 8, False)
-    blocks = []
-    for heard in (study, exported):
-        torch.manual_seed(0)
-        sionna.config.seed = 0
-        band = Band(heard, study, torch.full((32,), 1e-3))
-        blocks.append(pusch.run(band, 3.0, np.arange(512) % 32, 128))
-    for name in ("perfect", "predicted"):
-        there, here = (one[one.receiver == name] for one in blocks)
-        assert 0.02 < there.failed.mean() < 0.98 and (there.failed != here.failed).mean() < 0.01
-        assert (there.wrong - here.wrong).abs().mean() < 1e-3
