@@ -158,12 +158,3 @@ def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
     densify.on_train_batch_start(trainer, module)
     assert seen == [({"densify/removed": 0, "densify/added": 2}, 200)]
     assert "step 200: 0 Gaussians removed or split, 2 added: 10 -> 12" in caplog.text
-
-
-def test_a_short_training_with_a_schedule_of_shares_keeps_its_gaussians(model):
-    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[])
-    densify = Densify(0.1, 0.6, 0.05, grad_threshold=0.5, size_share=1.0)
-    for step in range(1, 21):
-        with_gradient(densify, [2, 7])
-        densify.on_train_batch_start(trainer, at(model, step, 20))
-    assert len(model.gaussians) == 10

@@ -32,14 +32,6 @@ def test_every_gaussian_has_a_network_of_its_own(hidden):
         assert torch.allclose(many.logits(where)[:, i], want, atol=1e-6)
 
 
-def test_one_gaussian_does_not_see_the_weights_of_another():
-    many = emission()
-    many.logits(torch.rand(3, 3))[:, 2].sum().backward()
-    for parameter in many.parameters():
-        others = [0, 1, 3, 4]
-        assert parameter.grad[2].any() and (parameter.grad[others] == 0).all()
-
-
 def test_activations():
     where, apart = torch.rand(2, 3), torch.full((2, 5), 3.0)
     plain = emission(activation="linear")
@@ -78,8 +70,3 @@ def test_inverse_of_impossible_powers_is_finite(activation):
     assert torch.isfinite(
         many.inverse(torch.tensor([[[-3.0], [0.0], [1.0], [40.0], [1e-9]]]), torch.ones(1, 5))
     ).all()
-
-
-def test_no_gaussians_emit_nothing():
-    for hidden in (0, 4):
-        assert emission(hidden, count=0)(torch.rand(3, 3), torch.ones(3, 0)).shape == (3, 0, 2)

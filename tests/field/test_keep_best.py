@@ -38,10 +38,14 @@ def held_out(method, measured):
     return float((method.predict(batch).mean - batch.target).square().mean())
 
 
-def test_steps_that_pay_are_kept(measured, tmp_path):
+def test_steps_that_pay_are_kept_and_a_resumed_run_keeps_the_same(measured, tmp_path):
     before = fitted(measured, tmp_path / "none", steps=1)
-    after = fitted(measured, tmp_path / "some")
-    assert after.steps >= 10 and held_out(after, measured) < 0.9 * held_out(before, measured)
+    whole = fitted(measured, tmp_path / "whole", every=10)
+    assert whole.steps >= 10 and held_out(whole, measured) < 0.9 * held_out(before, measured)
+    again = fitted(measured, tmp_path / "again", every=10, resume=tmp_path / "whole" / "last.ckpt")
+    first, second = whole.fitted().state_dict(), again.fitted().state_dict()
+    same = [np.allclose(a, second[key]) for key, a in first.items() if isinstance(a, torch.Tensor)]
+    assert all(same) and again.steps == whole.steps
 
 
 def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
@@ -63,20 +67,6 @@ def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tm
     method.fit(data, fold, FitContext(tmp_path, batch_size=8))
     assert method.steps == 0 and method.steps_taken == PATIENCE * (60 // LOOKS)
     assert f"no significant gain in {PATIENCE} validations" in caplog.text
-
-
-def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):
-    wild = ("init=images", "model.optimizer.emission=50.0")
-    assert fitted(measured, tmp_path / "wild", *wild, "model.refit=true").steps == 0
-    assert fitted(measured, tmp_path / "tame", "model.refit=true").steps >= 10
-
-
-def test_a_resumed_run_ends_with_the_same_parameters(measured, tmp_path):
-    whole = fitted(measured, tmp_path / "whole", every=10)
-    again = fitted(measured, tmp_path / "again", every=10, resume=tmp_path / "whole" / "last.ckpt")
-    first, second = whole.fitted().state_dict(), again.fitted().state_dict()
-    same = [np.allclose(a, second[key]) for key, a in first.items() if isinstance(a, torch.Tensor)]
-    assert all(same) and again.steps == whole.steps
 
 
 def test_a_budget_spent_before_the_first_step_took_steps_that_nothing_spoke_for(measured, tmp_path, caplog):

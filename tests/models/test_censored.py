@@ -14,7 +14,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.powers.settings import fit_power_process
 from gsparc.models.registry import build
-from gsparc.models.target_rows import heard_rows, unheard_note
+from gsparc.models.target_rows import heard_rows
 from gsparc.processes.powers import PowerRows
 from gsparc.training.context import FitContext
 
@@ -122,14 +122,6 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     assert not again.fit(data, Fold(heard_rows(data, rows), rows[:0], asked), FitContext()).notes
     batch = data.batch(asked)
     assert torch.equal(found.predict(batch).mean, again.predict(batch).mean)
-
-
-def test_without_censoring_all_rows_were_heard():
-    data, _, _ = town(20)
-    plain = replace(data, censored=None, mask=None)
-    assert np.array_equal(heard_rows(plain, np.array([3, 1])), [3, 1]) and not unheard_note(
-        plain, np.arange(3)
-    )
 
 
 def test_nothing_heard_at_all_is_finite():

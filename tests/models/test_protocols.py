@@ -15,20 +15,18 @@ import kinds
 import numpy as np
 import pytest
 import torch
-from campaigns import RENDERED, channels, compose, powers, spectra
+from campaigns import RENDERED, compose
 from cities import city
 from contexts import short
 from rooms import directed, shoebox
 from scenes import fold_of, lobes, room
 from worlds import World, arrays
 
-from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
-from gsparc.models import method as protocols
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, suitable_threads
 from gsparc.models.moving_array.method import MovingArrayField
@@ -41,25 +39,7 @@ from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
-PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
-DECLARED = {
-    **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink"), ""),
-    **dict.fromkeys(PEERS, ""),
-    "calibrated_raytracer": "",
-    "distance_law": "",
-    "gp": "",
-    "complex_gp": "",
-    "directional_gp": "HasPaths",
-    "image_source_gp": "HasPaths",
-    "splat": "",
-    "array": "",
-    "moving_array": "",
-    **dict.fromkeys(("array_process", "image_process", "gsparc"), ""),  # gsparc of spectra
-    **dict.fromkeys(("image_sources", "channels", "powers", "bearings"), "HasPaths"),
-}
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
-GRADIENTS = ("distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array")
-GRADIENTS += ("moving_array", "splat", "gsparc", *NAMED)  # see tests/prediction/test_gradients.py
 VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
@@ -73,43 +53,25 @@ UPLINK: dict[str, dict[str, Any]] = {
     "ridge": {}, "fire": {"max_steps": 3},
     "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
 }  # fmt: skip
-PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
-FILES = {  # of rendered Gaussians, by what they render
-    "gsparc": spectra,
-    "gsparc of a moving array": lambda path: spectra(path, moving="rx"),
-    "gsparc of channels": lambda path: channels(path, shape="S"),
-    "gsparc of powers": powers,
+
+
+MAKES = {  # what others than of received powers are fitted to
+    **dict.fromkeys(("gp", "gsparc", "image_process"), kinds.images),
+    **dict.fromkeys(("complex_gp", "channels", "image_sources"), kinds.gains),
+    **dict.fromkeys(("array", "splat", "array_process"), kinds.static_array),
+    **dict.fromkeys(("moving_array", "bearings"), kinds.moving_array),
+    **dict.fromkeys(SMALL, lambda folder: lobes(folder)[0]),
+    **dict.fromkeys(("ngrf", "newrf"), lambda _: room(40, directions=True)[0]),
+    **dict.fromkeys(UPLINK, lambda _: city("all")),
+    "directional_gp": lambda _: directed(60)[0],
+    "image_source_gp": lambda _: shoebox(60)[1],
 }
 
 
-def data_of(name: str, folder: Path) -> Measurements:
-    if name in FILES:
-        return load({"name": "own", "file": str(FILES[name](folder / "own.npz"))})
-    if name == "directional_gp":
-        return directed(60)[0]
-    if name in ("image_source_gp", "gsparc of sources"):
-        return shoebox(60)[1]
-    if name in ("array", "splat"):
-        return kinds.static_array(folder)
-    if name == "moving_array":
-        return kinds.moving_array(folder)
-    if name in SMALL:
-        return room(40, directions=True)[0] if name in ("ngrf", "newrf") else lobes(folder)[0]
-    if name in UPLINK:
-        return city("all")
-    make = {
-        "gp": kinds.images, "complex_gp": kinds.gains, "channels": kinds.gains, "image_sources": kinds.gains,
-        "array_process": kinds.static_array, "image_process": kinds.images, "bearings": kinds.moving_array,
-    }.get(name, kinds.received)  # fmt: skip
-    return make(folder)
-
-
 def unfitted(name: str) -> MethodFactory:
-    few = ("model.field.count=40", "model.keep_best=false")
-    if name in FILES:
+    if name == "gsparc":
+        few = ("model.field.count=40", "model.keep_best=false")
         return build(compose("model=gsparc", *RENDERED, *few).model)
-    if name == "gsparc of sources":
-        return build(compose("model=gsparc", "init.searches=1", "init.search_rows=60").model)
     if name == "image_source_gp":
         return ImageSourceGP(searches=1, search_rows=60, clutter=False)
     if name == "array":
@@ -126,7 +88,7 @@ def unfitted(name: str) -> MethodFactory:
 @cache
 def fitted(name: str) -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
-        data = data_of(name, Path(folder))
+        data = MAKES.get(name, kinds.received)(Path(folder))
         method = unfitted(name).create_for(data)
         fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
@@ -150,15 +112,6 @@ def ends(method: Method, moving: torch.Tensor) -> Query:
         return Query(still.expand(len(moving), 3), Pose.identity(moving))
     turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     return Query(moving, Pose(still, torch.from_numpy(turn).float()))
-
-
-@pytest.mark.parametrize("name", methods())
-def test_a_method_is_what_the_table_says(name, tmp_path):
-    method = method_class(name)().create_for(data_of(name, tmp_path))
-    kept_to = {word for word in PROTOCOLS if isinstance(method, getattr(protocols, word))}
-    assert kept_to == set(DECLARED[name].split())
-    assert method.resumable == (name in (*PEERS, "fire", "splat", "gsparc", *NAMED))
-    assert (method.gradient_problem() is None) == (name in GRADIENTS)
 
 
 @pytest.mark.parametrize("name", VARIANCE)

@@ -87,6 +87,10 @@ def test_an_array_may_be_switched_off():
     [
         ("unplaced csi", {"phase": True}, r"effects\.phase=true is not possible: the dataset does not say"),
         ("moving array", {"array": True}, "the receiver moves"),
+        ("array", {"moving_array": True}, r"moving_array=true is not possible: the receiver stands still"),
+        ("spectrum", {"array": True}, "the dataset declares no array or no carrier"),
+        ("csi", {"power": True}, r"^model\.effects\.power=true is not possible: the target is csi[^\n]*$"),
+        ("rssi", {"phase": True}, "the target is rssi, which carries no phase"),
         ("spectrum", {"visibility": False}, "visibility=false is not possible: rasterized"),
         ("csi", {"phase": "splat"}, "one of true, false, auto"),
     ],

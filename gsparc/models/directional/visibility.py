@@ -111,7 +111,7 @@ class RayErrorRates:
         """Estimate from rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
-        return RayErrorRates(max(missed, MIN_RATE), max(spurious, MIN_RATE))
+        return RayErrorRates(*(min(max(rate, MIN_RATE), 1 - MIN_RATE) for rate in (missed, spurious)))
 
     def odds(self, rays: Tensor, probability: Tensor) -> Tensor:
         """Log odds (n, K) that a source is seen, by rays and the neighbours' probability (n, K)."""

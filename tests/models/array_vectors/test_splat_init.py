@@ -91,33 +91,6 @@ def test_all_is_unknown_far_away_and_little_at_data(trained):
     assert (method.fitted().unknown(tx, rx) < 0.05).all()
 
 
-def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
-    method, data, fold = trained
-    model, batch = method.fitted(), data.batch(fold.test[:3])
-    live = model(batch.tx, batch.rx)
-    quick = method.predict(batch)
-    torch.testing.assert_close(live.mean.clamp(0, 1), quick.mean, atol=1e-3, rtol=0)
-    (live.mean - batch.target).square().sum().backward()
-    for parameter in (model.gaussians.means, model.gaussians.opacity_logits, model.emission.weight2):
-        assert torch.isfinite(parameter.grad).all() and parameter.grad.abs().sum() > 0
-    model.zero_grad()
-
-
-def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
-    data, _ = known_campaign
-    fold = Fold(np.arange(0, 120, 2), np.arange(1, 40, 4), np.arange(121, 160, 2))
-    asked = "model.keep_best=false", "model.refit=false"
-    more = _trained(data, fold, tmp_path, COUNT, *asked, steps=6)
-    none = _trained(data, fold, tmp_path, COUNT, "model.steps=0", "model.refit=false")
-    moved = (more.fitted().gaussians.means - none.fitted().gaussians.means).abs().max()
-    assert moved > 1e-6 and more.effects == "array"
-    errors = [
-        (m.predict(Query(*_ends(data, fold.test))).mean - data.targets(fold.test)).square().mean()
-        for m in (more, none)
-    ]
-    assert errors[0] < 2 * errors[1]
-
-
 def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))

@@ -70,18 +70,6 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     assert torch.allclose(found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3)
 
 
-def test_it_knows_what_it_does_not_know(campaign, folds, tmp_path):
-    data, fold = campaign("spectrum", 120), folds(120).folds[0]
-    gp = GaussianProcess()
-    gp.fit(data, fold, FitContext(tmp_path))
-    batch = data.batch(fold.test)
-    near, far = gp.predict(batch), gp.predict(Query(batch.tx + 1000.0, batch.rx))
-    assert near.confidence.min() > far.confidence.max() and far.confidence.max() < 1e-6
-    assert near.confidence.max() <= 1
-    ratio = float(((near.mean - batch.target) ** 2).mean() / near.variance.mean())
-    assert 0.3 < ratio < 3
-
-
 @pytest.mark.parametrize("rows", [1, 2, 3])
 def test_hardly_any_samples(campaign, folds, tmp_path, rows):
     data = campaign("spectrum", 8)

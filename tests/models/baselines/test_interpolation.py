@@ -30,7 +30,7 @@ def fitted(name, data, fold, tmp_path):
 
 @pytest.mark.parametrize("static_end", ["rx", "tx"])
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "kriging"])
 def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind, static_end):
     data, fold = campaign(kind, 30, static_end), folds(30).folds[0]
     method = fitted(name, data, fold, tmp_path)
@@ -131,7 +131,8 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
     data = from_arrays({"rx_position": places, "tx_position": np.zeros(3), "rssi_db": -40 - places[:, 0]})
     method = kriging.Kriging()
     report = method.fit(data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path))
-    assert method.system is None and "of 70 places each query's nearest 20" in report.notes[0]
+    assert method.system is None and method.label == "kriging (nearest 20)"
+    assert "of 70 places each query's nearest 20" in report.notes[0]
     error = (
         10 * torch.log10(method.predict(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
     )

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import REAL
 from rooms import nmse, shoebox
 from scenes import error
 
@@ -16,8 +15,6 @@ from gsparc.models.run_factors import fit_run_factors
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
-
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 def _dense():
@@ -111,30 +108,34 @@ def _in_runs(factors, seed=0):
     return data, replace(data, target=target, run=run + 5), fold
 
 
-def test_runs_are_brought_together(tmp_path):
-    factors = [1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)]
-    clean, spread, fold = _in_runs(factors)
+FACTORS = [1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)]
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Receivers in three runs, and what is learned of them."""
+    clean, spread, fold = _in_runs(FACTORS)
+    return clean, spread, fold, *_fit(spread, fold)
+
+
+def test_runs_are_brought_together(dense, runs):
+    clean, spread, fold, method, notes = runs
     truth = clean.batch(fold.test).target.numpy()
-    errors = {}
-    for name, data in (("one", clean), ("known", spread), ("ignored", replace(spread, run=None))):
-        method, notes = _fit(data, fold)
-        batch = data.batch(fold.test)
-        errors[name] = nmse(method.predict(Query(batch.tx, batch.rx)).mean.numpy(), truth)
-        if name == "known":
-            assert notes[1].startswith(
-                "complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: "
-            )
-            ratio = method.runs.of(torch.tensor([5, 6, 7])).numpy() / factors
-            assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
-            again = _restored(method, data.site, tmp_path)
-            torch.testing.assert_close(again.predict(batch).mean, method.predict(batch).mean)
-    assert errors["known"] < 1.5 * errors["one"] < 0.5 * errors["ignored"], errors
+    ignored, _ = _fit(replace(spread, run=None), fold)
+    one, known, other = (
+        nmse(each.predict(Query(*ends)).mean.numpy(), truth)
+        for ends in [(clean.batch(fold.test).tx, clean.batch(fold.test).rx)]
+        for each in (dense[2], method, ignored)
+    )
+    assert known < 1.5 * one < 0.5 * other, (one, known, other)
+    assert notes[1].startswith("complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: ")
+    ratio = method.runs.of(torch.tensor([5, 6, 7])).numpy() / FACTORS
+    assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
 
 
-def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(tmp_path):
+def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(runs, tmp_path):
     """A right prediction of a row in another run's phase was an error of up to four times its power."""
-    _, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
-    method, _ = _fit(spread, fold)
+    _, spread, fold, method, _ = runs
     batch = spread.batch(fold.test)
     here = method.predict(batch).mean
     assert nmse(here.numpy(), batch.target.numpy()) < 0.2 * error(method, spread, fold.test)
@@ -179,19 +180,3 @@ def test_channels_without_noise():
     rows = np.arange(120)
     method, _ = _fit(data, Fold(rows[:-1], rows[:0], rows[-1:]))
     assert error(method, data, rows[-1:]) < 0.1
-
-
-@pytest.mark.skipif(not CHANNELS.is_file(), reason="measured channels are not beside this checkout")
-def test_two_measured_runs_differ_by_one_phase():
-    """Antenna 0: with its own factor the other run helps; without, it harms."""
-    with np.load(CHANNELS) as stored:
-        used = np.flatnonzero(stored["mask"][:, 0])
-        places, csi = stored["tx_position"][used], stored["csi"][used, 0]
-        run = (stored["run"][used] == "EXP006").astype(np.int64)
-        still, tone = stored["rx_antenna_position"][0], stored["frequency_hz"].reshape(1)
-    arrays = {"tx_position": places, "rx_position": still, "csi": csi, "frequency_hz": tone}
-    data = from_arrays(arrays, {"name": "ceiling"})
-    drawn = np.random.default_rng(0).permutation(np.flatnonzero(run == 0))
-    fold = Fold(np.setdiff1d(np.arange(len(run)), drawn[:150]), drawn[:0], drawn[:150])
-    errors = [error(_fit(replace(data, run=known), fold)[0], data, fold.test) for known in (run, None)]
-    assert errors[0] < 0.35 and errors[0] < 0.95 * errors[1], errors

@@ -16,6 +16,7 @@ from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.experiment.study import add_direction_errors
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP
+from gsparc.models.directional.position_refine import UncertainPositions
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.rows import draw_rows
@@ -182,6 +183,20 @@ def test_a_channel_restores_a_missed_ray():
     # no neighbour sees it and the residual is zero: noise adds no visibility
     quiet = entries_to_flip(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
     assert not bool(quiet[rays == 0].any())
+
+
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+def test_where_every_ray_was_wrong_the_odds_divided_by_zero(seen):
+    """One channel of 80 dB too much hides all sources from all receivers: a share of one has no odds."""
+    rays, truth = torch.full((4, 2), 1 - seen), torch.full((4, 2), seen)
+    assert torch.isfinite(RayErrorRates.of(rays, truth).odds(rays, 0.5 * torch.ones(4, 2))).all()
+
+
+def test_sources_that_errors_blur_are_told_from_sharp_ones():
+    blurred = torch.tensor([0.0, 1e-2])[:, None].expand(2, 3).diag_embed().double()
+    sources = UncertainPositions(torch.tensor([[5.0, 0, 0], [0, 5, 0]]).double(), blurred)
+    places = torch.rand(20, 3, generator=torch.manual_seed(0)).double()
+    assert sources.uncertain(places, torch.tensor(2.4e9)).tolist() == [1]
 
 
 def _random_rays(data):

@@ -111,18 +111,6 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
 
 
-def test_concatenated_scenes_do_not_interact():
-    planes, clutter = _table()
-    places = _rows(15).position
-    one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
-    two = _scene(_boxed(_box()))
-    members = [Posterior(_rows(3), phased(each, torch.zeros(len(each.sequences)))) for each in (one, two)]
-    together = EnsembleMeans(members).visible_share(places)
-    torch.testing.assert_close(
-        together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
-    )
-
-
 def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
     scenes = [_scene(_boxed(_box())), _scene(Clutter.none())]
@@ -197,6 +185,18 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
     return _unexplained(rows, _bare()), clutter
+
+
+def test_candidates_are_met_where_unfolded_paths_meet_them():
+    """By itself, after a wall, and before one."""
+    rows, planes = _rows(40), torch.cat([WALLS[:1], TABLE[None]])
+    found = finite_mirrors._sources(rows, TRANSMITTER, TABLE[None], WALLS[:1])
+    for (_, met), (word, corner) in zip(found, (((1,), 0), ((0, 1), 0), ((1, 0), 1)), strict=True):
+        paths = Unfolding(TRANSMITTER, planes, (word,)).paths(rows.position)
+        seen = torch.isfinite(met[0, :, 0]) & paths.valid[0]
+        apart = (met[0, seen] - paths.end[0, seen, corner]).norm(dim=1)
+        # Both orders of perpendicular mirrors have one image; few places see it in the second.
+        assert len(apart) and (apart < 1e-3).float().mean() > 0.9
 
 
 def test_a_table_top_is_found_by_its_reflections():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gains import fitted, phased
+from rooms import shoebox
 from scenes import error, fold_of
 
 from gsparc.data.own import from_arrays
@@ -94,18 +95,6 @@ def test_paths_of_each_antenna_sum_to_the_prediction(four):
     assert (delay[:, :, 0] * LIGHT - direct).abs().max() < 0.01
 
 
-def test_both_directions_have_the_same_channels(four):
-    """Reciprocity: from a sender at an antenna to where the transmitter was is the way back."""
-    method, data, fold = four
-    scene, middle = method.members[0].scene, method.frame.middle
-    antennas = torch.from_numpy(static_array(data.site, 4)) + scene.transmitter
-    place = torch.from_numpy(data.moving[fold.test[:3]]) - middle
-    there = torch.cdist(images(antennas, scene.planes, scene.sequences).flatten(0, 1), place)
-    turned = [sequence[::-1] for sequence in scene.sequences]
-    back = torch.stack([torch.cdist(images(p, scene.planes, turned), antennas) for p in place], -1)
-    torch.testing.assert_close(there.view(4, -1, 3), back.transpose(0, 1))
-
-
 def test_orientation_of_first_and_second_order():
     """Mirrors in planes of any slant: the image of an antenna is that of the centre plus Q a."""
     draws = torch.Generator().manual_seed(0)
@@ -185,34 +174,9 @@ def test_antennas_of_unknown_places_are_outputs_of_their_own():
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
 
 
-def _ofdm(count, noise):
-    """Receivers with 4 antennas and 52 tones at 5.18 GHz in a room, hardly any noise."""
-    rng = np.random.default_rng(1)
-    places = rng.uniform([0.2, 0.2, 0.5], [2.8, 2.3, 1.5], (count, 3))
-    tones = 5.18e9 + 312500.0 * np.arange(-26, 26)
-    array = np.c_[np.zeros(4), (np.arange(4) - 1.5) * LIGHT / 5.18e9 / 2, np.zeros(4)]
-    channels = np.stack([_channels(p + array, CENTRE[None], tones)[:, 0] for p in places])
-    shape, power = channels.shape, noise * (np.abs(channels) ** 2).mean()
-    channels = channels + np.sqrt(power / 2) * (rng.standard_normal((*shape, 2)) @ [1, 1j])
-    data = from_arrays(
-        {
-            "tx_position": CENTRE, "rx_position": places, "array_position": array, "csi": channels,
-            "frequency_hz": tones,
-        }
-    )  # fmt: skip
-    return data, fold_of(data)
-
-
-@pytest.mark.slow
-def test_ofdm_with_hardly_any_noise(tmp_path):
-    """It ended in "cholesky: not positive-definite": rows over noise exceeded what float32 can add to 1."""
-    data, fold = _ofdm(100, 1e-9)
-    method, _ = fitted(data, fold, tmp_path, search_rows=220, margin=4.0)
-    assert error(method, data, fold.test) < 0.02
-
-
 def test_rows_draw_antennas_so_that_places_are_many():
-    data, fold = _ofdm(60, 1e-3)
+    tones, array = CARRIER + 1e6 * np.arange(8), np.eye(4, 3) / 30
+    _, data, fold = shoebox(60, max_order=0, frequency_hz=tones, array=array)
     rows = draw_rows(data, fold.train, 2 * len(fold.train), 0)
     assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
 
@@ -231,15 +195,6 @@ def test_clutter_is_looked_for_without_noise():
     silent = replace(scene, log_noise=-40.0, visibility=KernelVisibility(0.999, 5.0, 50.0))
     again = ClutterLikelihood(rows, phased(silent, torch.zeros(2), 0.15))
     assert np.isfinite(again.nll(torch.ones(2, len(rows)), silent.log_amplitude).item())
-
-
-def test_budget_is_kept(tmp_path):
-    """To a tenth and a step, however many searches are asked for."""
-    data, fold = _uplink(100)
-    method = ImageSourceGP(searches=6, search_rows=220, margin=8.0)
-    started = time.process_time()
-    report = method.fit(data, fold, FitContext(tmp_path, budget_s=0.5, budget_clock="processor"))
-    assert time.process_time() - started < 0.55 + 2.0 and report.limited_by == "processor"
 
 
 def test_an_interrupt_ends_all_searches(tmp_path, monkeypatch):

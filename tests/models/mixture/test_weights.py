@@ -29,16 +29,6 @@ def noisy(share: float, seed: int) -> torch.Tensor:
     return TARGET + share * torch.from_numpy(np.random.default_rng(seed).standard_normal(TARGET.shape))
 
 
-def test_equal_errors_share_and_large_ones_have_nothing():
-    found = stacking_weights([noisy(0.3, 1), noisy(0.3, 2), noisy(5.0, 3)], TARGET, EACH)
-    assert sum(found) == pytest.approx(1) and found[2] == 0
-    assert found[0] == pytest.approx(0.5, abs=0.1)
-
-
-def test_one_far_ahead_predicts_alone():
-    assert stacking_weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET, EACH) == (1.0, 0.0)
-
-
 def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
     few = stacking_weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
     assert (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
+from closed import read_back
 from scipy.optimize import nnls
 
 from gsparc.data.query import Query
@@ -13,14 +14,19 @@ from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings, find_sources, nonnegative_powers
+from gsparc.models.moving_array.triangulate import (
+    SearchSettings,
+    find_sources,
+    nonnegative_powers,
+    site_problem,
+)
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import SpectrumLags
 from gsparc.simulate.shoebox import mirror_images
 from gsparc.training.context import FitContext
 
+ROWS = np.arange(0, 160, 2)
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
-QUICK = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +49,53 @@ def fitted(data, fold, tmp_path_factory):
     method = MovingArrayField(search=SEARCH, components=64)
     assert method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run"))).seconds > 0
     return method
+
+
+@pytest.fixture
+def field(data, fitted):
+    """A copy of its own, with all that conditioning leaves."""
+    again = read_back(fitted)
+    again.condition(data, ROWS)
+    return again
+
+
+def missed(field, data, rows):
+    batch = data.batch(rows)
+    return float((field.predict(batch).mean - batch.target).square().mean())
+
+
+def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
+    assert field.terms == ("moving_array", "residual")
+    np.testing.assert_array_equal(field.found.sources[0], np.float32(data.site.static_position))
+    batch = data.batch(np.arange(1, 31, 2))
+    posterior = field.predict(batch)
+    explained, mean, energy, _ = field.query()(batch.places(data.site))
+    torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
+    added = field.basis.of(mean - explained)
+    torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)
+    whole = (explained + field.basis.images(added)).clamp(0, 1)
+    torch.testing.assert_close(posterior.mean, whole, rtol=0, atol=1e-4)
+    alone = float((explained.clamp(0, 1) - batch.target).square().mean())
+    assert missed(field, data, np.arange(1, 160, 2)) < alone
+    assert posterior.variance.shape == posterior.unknown.shape == (15,)
+
+
+def test_more_rows_condition_it_better(data, field):
+    places, test = field.found.sources.clone(), np.arange(1, 160, 4)
+    before = missed(field, data, test)
+    field.condition(data, np.concatenate([ROWS, np.arange(3, 160, 4)]))
+    assert missed(field, data, test) < before
+    assert len(field.left_out().rows) == 120 and torch.equal(places, field.found.sources)
+    field.condition(data, ROWS)
+    assert missed(field, data, test) == pytest.approx(before, rel=1e-3)
+
+
+def test_left_out_rows_are_about_as_wrong_as_new_ones(data, field):
+    left = field.left_out()
+    np.testing.assert_array_equal(left.rows, ROWS)
+    error = (left.mean - data.batch(ROWS).target).square().mean((1, 2))
+    torch.testing.assert_close(left.variance, error, rtol=1e-4, atol=1e-7)
+    assert 0.5 < float(error.mean()) / missed(field, data, np.arange(1, 160, 2)) < 2
 
 
 def test_the_strong_images_are_found(data):
@@ -91,13 +144,6 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
 
 
-def test_a_search_ends_when_the_seconds_are_over(data, fold, tmp_path):
-    """The clock that ended it was not reported."""
-    method = MovingArrayField(search=QUICK, components=16)
-    report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3, budget_clock="processor"))
-    assert report.limited_by == "processor" and not method.resumable
-
-
 def test_powers_are_the_best_that_are_not_negative():
     rng = np.random.default_rng(0)
     atoms, lags = (torch.from_numpy(rng.normal(size=s)).float() for s in ((3, 6, 20), (3, 20)))
@@ -113,7 +159,7 @@ def test_power_spectra_are_recognised(fold, tmp_path):
     assert method.exponent == 1 and method.residual.axes.shape[0] == 0
 
 
-def test_unusable_data_are_refused(data, fold, tmp_path):
+def test_unusable_data_are_refused(data, fold, fitted, tmp_path):
     def refused(words, **changes):
         site = dataclasses.replace(data.site, **changes)
         with pytest.raises(ValueError, match=words):
@@ -121,6 +167,9 @@ def test_unusable_data_are_refused(data, fold, tmp_path):
 
     refused("moving receiver", static_end="rx")
     refused("no array", array=None)
+    assert site_problem(data) is None
+    with pytest.raises(ValueError, match="empty"):
+        read_back(fitted).condition(data, ROWS[:0])
     turned = data.rx_rotation.copy()
     turned[3] = np.diag([-1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="one orientation"):

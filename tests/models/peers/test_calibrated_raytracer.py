@@ -13,11 +13,9 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.peers.calibrated_raytracer import CalibratedRayTracer
 from gsparc.simulate import llvm
 from gsparc.simulate.calibration import (
-    GENERIC,
     Material,
     Replay,
     apply_materials,
-    calibrate,
     fit_gain_and_scale,
     student_loss,
     used_materials,
@@ -133,43 +131,6 @@ def test_gradients_are_the_powers_own(wall):
         step = 0.02 * np.eye(2)[which]
         up, down = (value({**at, name: at[name] + sign * step})[0] for sign in (1, -1))
         assert slope == pytest.approx((up - down) / 0.04, rel=0.03, abs=0.02 * np.abs(slopes).max())
-
-
-@pytest.mark.slow
-def test_steps_compile_nothing(wall):
-    """Flags of paths were changed in place: each step had a longer kernel than the one before."""
-    import drjit as dr
-
-    materials = {name: TRUE.logarithms() for name in used_materials(wall)}
-    replay, longest = Replay(wall, places(), PLAIN), []
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for _ in range(3):
-            dr.kernel_history()
-            replay.decibels(materials, lambda db: (0.0, np.ones(60)))
-            longest.append(max(kernel.get("operation_count", 0) for kernel in dr.kernel_history()))
-    assert longest[1] == longest[2]
-
-
-@pytest.mark.slow
-def test_a_replay_is_the_trace(wall):
-    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
-    traced = wall.trace(places(), PLAIN).received_power()
-    np.testing.assert_allclose(Replay(wall, places(), PLAIN).powers(), traced, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_gain_and_powers_elsewhere_are_found_again(wall):
-    """Not the materials one by one: sheets resonate, and several explain the powers alike."""
-    materials, learned = used_materials(wall), slice(0, 60)
-    apply_materials(wall, dict.fromkeys(materials, TRUE))
-    measured = 10 * np.log10(wall.trace(places(90), PLAIN).received_power()) + GAIN_DB
-    start = dict.fromkeys(materials, GENERIC)
-    apply_materials(wall, start)
-    replay = Replay(wall, places(90)[learned], PLAIN)
-    found = calibrate(replay, start, replay.powers(), measured[learned], 80)
-    assert found.gain_db == pytest.approx(GAIN_DB, abs=0.3) and found.scale_db == 0.5
-    again = 10 * np.log10(wall.trace(places(90)[60:], PLAIN).received_power()) + found.gain_db
-    assert np.sqrt(np.mean((again - measured[60:]) ** 2)) < 0.5
 
 
 @pytest.mark.slow

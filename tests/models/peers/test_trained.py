@@ -104,21 +104,6 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
             assert seen[0][2] > 0.9 and seen[-1][2] == pytest.approx(0.02), "rates fall to a fiftieth"
 
 
-def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, monkeypatch):
-    """The schedule followed the seconds where these were ahead: three runs, three models, and no word."""
-    data, fold = lobes(tmp_path)
-    clock, weights = wound(monkeypatch).process_time, []
-    for slow_s in (0.0, 0.2, 9.0):
-        method = brief("swiftwrf", budget_s=1.0)
-        build = method.makes
-        method.makes = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
-        report = method.fit(data, fold, FitContext(tmp_path))
-        assert report.limited_by == ("processor" if slow_s > 1 else None)
-        assert method.steps == (0 if slow_s > 1 else 3)
-        weights.append(torch.cat([w.flatten() for w in method.fitted().state_dict().values()]))
-    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
-
-
 class Cut(L.Callback):
     """Presses Ctrl-C in a step, and counts the steps that were taken."""
 

@@ -12,13 +12,11 @@ import torch
 from closed import fitted_to, read_back
 
 from gsparc.data.own import from_arrays
-from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.powers.field import PowerField
-from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.prior import Prior
@@ -89,30 +87,6 @@ def blocked(tmp_path_factory):
     return data, field, notes
 
 
-def test_a_known_wall_explains_powers_behind_it(blocked):
-    data, field, notes = blocked
-    batch = data.batch(np.arange(160, 260))
-    plain, _ = fitted_to(PowerField(), data, np.arange(160))
-    plain.condition(data, np.arange(160))
-    truth = db(batch.target)
-    errors = [np.mean((db(f.predict(batch).mean) - truth) ** 2) for f in (field, plain)]
-    assert field.terms == ("power", "residual") and errors[0] < 0.7 * errors[1], (errors, notes)
-
-
-def test_far_away_the_variance_is_the_priors(blocked):
-    data, field, _ = blocked
-    near = data.batch(np.arange(5))
-    far = Pose(near.rx.position + torch.tensor([0.0, 1e7, 0.0]), near.rx.rotation)
-    there, here = field.predict(Query(near.tx, far)), field.predict(near)
-    assert here.unknown.max() < 0.6 and there.unknown.min() > here.unknown.max()
-    bare = small_field(data)
-    bare.condition(data, np.arange(50))
-    there = bare.predict(Query(near.tx, far))
-    prior = 9.0 * (1 + 0.2 + 1)  # the level's own variance is learned, all else is not
-    spread = there.variance.sqrt() / (math.log(10) / 10 * there.mean[:, 0])
-    assert torch.all(spread.square() > 0.5 * prior) and torch.all(spread.square() <= prior * 1.001)
-
-
 def test_left_out_rows_are_predicted_without_them():
     data = town(30)
     field = small_field(data)
@@ -126,31 +100,6 @@ def test_left_out_rows_are_predicted_without_them():
         told = field.predict(batch)
         assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
         assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
-
-
-def test_both_ends_may_move():
-    data = town(60)
-    rng = np.random.default_rng(0)
-    tx = np.array(STATION) + rng.normal(size=(60, 3))
-    arrays = {
-        "rx_position": data.rx_position + data.site.origin,
-        "tx_position": tx,
-        "rssi_db": db(data.targets(np.arange(60))),
-    }
-    data = from_arrays(arrays, {"name": "two ends"})
-    assert data.site.static_end is None
-    field, _ = fitted_to(PowerField(), data, np.arange(50))
-    field.condition(data, np.arange(50))
-    batch = data.batch(np.arange(50, 60))
-    assert torch.isfinite(field.predict(batch).mean).all()
-
-
-def test_what_cannot_be_is_refused():
-    data = town(20)
-    with pytest.raises(ValueError, match="at least one row"):
-        fitted_to(PowerField(), data, np.arange(0))
-    with pytest.raises(ValueError, match="condition it first"):
-        small_field(data).left_out()
 
 
 def test_settings_are_chosen_on_rows_that_no_clock_counts():

@@ -11,12 +11,10 @@ from closed import fitted_to, read_back
 from releases import REAL
 
 from gsparc.data.own import from_arrays
-from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.powers.field import PowerField
-from gsparc.ops import Pose
 from gsparc.processes import powers
 from gsparc.training.context import FitContext
 
@@ -124,19 +122,6 @@ def test_a_mixture_is_stored_whole(monkeypatch, nearest):
         told, found = (one.predict(batch) for one in (field, again))
         assert torch.allclose(told.mean, found.mean, rtol=1e-6)
         assert torch.allclose(told.variance, found.variance, rtol=1e-5)
-
-
-def test_a_mixture_has_slopes():
-    data = walks()
-    field = fitted(data, np.arange(140))
-    batch = data.batch(np.arange(150, 152))
-    place = batch.rx.position.double()
-    tx, turned = batch.tx.double(), batch.rx.rotation.double()
-
-    def mean(at: torch.Tensor) -> torch.Tensor:
-        return 10 * field.predict(Query(tx, Pose(at, turned))).mean.log10()
-
-    assert torch.autograd.gradcheck(mean, place.requires_grad_(), eps=1e-5, atol=1e-4)
 
 
 def test_few_rows_have_one_process():

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
@@ -24,8 +23,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
-
-CITY = REAL / "real" / "powder-rss-462mhz.npz"
+from tests.models.powers.test_mixture import CITY, measured, station
 
 
 def town(count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int = 0) -> Measurements:
@@ -62,19 +60,15 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
     assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()
 
 
-@pytest.mark.skipif(not CITY.exists(), reason=f"{CITY} is not here")
+@measured
 def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
     """97 rows of a measured station chose 2 km and next to no noise: up to 63 dBm where nobody measured."""
     with np.load(CITY) as stored:
-        station = stored["station"].tolist().index("law73-nuc2-b210")
-        decibels = stored["rssi_db"][:, station].astype(np.float64)
-        rows = np.random.default_rng(9).permutation(np.flatnonzero(np.isfinite(decibels)))[:97]
-        places = np.c_[stored["mobile_position"][rows], np.zeros(97)]
-        still = np.append(stored["station_position"][station], 0.0)
-    known = {"rx_position": places, "tx_position": still, "rssi_db": decibels[rows]}
-    data = from_arrays(known, {"name": "city"})
-    process, _ = fit_power_process(power_rows(data, np.arange(97)), data.site)
-    assert process.kernel.amplitude < 3 * decibels[rows].var()  # 6.6 times without the bound
+        number = stored["station"].tolist().index("law73-nuc2-b210")
+    data = station(number, 97, 9)
+    rows = power_rows(data, np.arange(97))
+    process, _ = fit_power_process(rows, data.site)
+    assert process.kernel.amplitude < 3 * rows.decibels.var()  # 6.6 times without the bound
 
 
 def test_the_mean_is_chosen_by_likelihood_and_by_name():
@@ -127,21 +121,6 @@ def test_five_thousand_rows(make):
     batch, _ = fit(method, data, 5_000)
     assert time.process_time() - started < 120
     assert error_db(method, batch) < 4.0
-
-
-@pytest.mark.skipif(not CITY.is_file(), reason="measured city powers are not beside this checkout")
-def test_a_measured_station():
-    """One station: the mean misses by 9 dB, all 3,300 rows by 4 dB."""
-    with np.load(CITY) as stored:
-        heard = np.flatnonzero(np.isfinite(stored["rssi_db"][:, 11]))
-        chosen = np.random.default_rng(0).permutation(heard)[:700]
-        places = np.pad(stored["mobile_position"][chosen], ((0, 0), (0, 1)))
-        station = np.append(stored["station_position"][11], 0.0)
-        decibels = stored["rssi_db"][chosen, 11].astype(float)
-    data = from_arrays({"tx_position": places, "rx_position": station, "rssi_db": decibels}, {"name": "city"})
-    method = GaussianProcess()
-    batch, _ = fit(method, data, 500)
-    assert error_db(method, batch) < 5.0
 
 
 def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():

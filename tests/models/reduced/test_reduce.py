@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -176,15 +175,6 @@ def test_rendered_channels_spare_directions(tmp_path):
 def own_copy(case):
     method = copy.copy(case.method)
     return case._replace(method=method)
-
-
-def test_what_a_process_beside_adds_stays(field):
-    both = own_copy(field)
-    plain = both.answer(both.less(stride=2)).mean
-    beside = SimpleNamespace(predict=lambda query: SimpleNamespace(mean=torch.ones_like(plain)))
-    beside.reduced = lambda *settings: beside
-    both.method._average = (beside, 0.25)
-    assert torch.allclose(0.75 * plain + 0.25, both.answer(both.less(stride=2)).mean)
 
 
 @pytest.mark.parametrize("stride", [1, 2])

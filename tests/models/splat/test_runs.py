@@ -12,13 +12,10 @@ from gsparc.commands.train import train
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
-from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.scores import score_methods, unseen_runs
 from gsparc.models import loading
-from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction
 from gsparc.models.run_factors import RunFactors
-from gsparc.training.context import FitContext
 
 
 def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
@@ -43,18 +40,6 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
     assert torch.allclose(again.predict(batch).mean, method.predict(batch).mean, atol=1e-5)
     turned = method.predict(batch).mean / method.predict(Query(batch.tx, batch.rx)).mean
     assert len(np.unique(np.round(np.angle(turned.flatten().numpy()), 3))) == 5  # a phase for each run
-
-
-def test_both_ends_may_move_in_channels():
-    data = from_arrays(arrays(World("antennas", 1, 1, "both", "metres", "none", "random", 300), 0))
-    split = split_for({"name": "random"}, data)
-    method = Gsparc().create_for(data)
-    method.fit(data, split.folds[0], FitContext(budget_s=5.0, budget_clock="processor"))
-    own, plain = (
-        score_methods([method], data, split).figures(),
-        fit_baseline("gp", data, split).scores.figures(),
-    )
-    assert own["nmse"] < 0.9 * plain["nmse"] and "direct" in method.effects
 
 
 class Turned(Method):

@@ -1,4 +1,4 @@
-"""Faces joined to planes and rectangles; images in them against those of the simulator."""
+"""Faces joined to planes and rectangles, images in them against the simulator's, walls that paths cross."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.known import images as known
-from gsparc.models.image_sources.known.images import Mirrors, initial_log_amplitudes, most_mirrors
+from gsparc.models.image_sources.known.images import (
+    Mirrors,
+    walls_of_file,
+)
 from gsparc.physics.mirror_planes import images
 
 ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)
@@ -61,17 +64,6 @@ def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
     assert len(mirrors.obstacles_of(sequences, transmitter, behind).patches) == 0
 
 
-def test_long_sequences_are_of_the_largest_walls():
-    assert [most_mirrors(6, length) for length in (1, 2, 3)] == [6, 6, 6]
-    assert [most_mirrors(100, length) for length in (1, 2, 3)] == [100, 55, 15]
-    assert most_mirrors(0, 2) == 0
-
-
-def test_amplitudes_fall_with_the_order():
-    found = initial_log_amplitudes(((), (0,), (0, 1)), 2.0).exp()
-    assert torch.allclose(found, torch.tensor([2.0, 1.2, 0.72]))
-
-
 NOTHING = np.zeros((0, 2, 3))
 
 
@@ -102,3 +94,27 @@ def test_of_a_fine_mesh_the_smallest_are_left_out(monkeypatch):
     found = Mirrors.of(SceneWalls(faces, NOTHING), np.zeros(3))
     assert found.left_out == 1 and len(found.clutter.patches) == 2
     assert torch.isfinite(found.clutter.patches).all()
+
+
+WALL = np.array([[2.0, -3, 0], [2, 3, 0], [2, 3, 3], [2, -3, 3]])
+FLOOR = np.array([[-5.0, -5, 3], [5, -5, 3], [5, 5, 3], [-5, 5, 3]])
+BOX = np.array([[[0.0, 5, 0], [1, 6, 2]]])
+
+
+def test_walls_floors_and_both_sides_of_a_box_are_counted():
+    walls = walls_of_file(SceneWalls((WALL, FLOOR), BOX), np.array([0.0, 0, 1]), np.array([0.0, 0, 0.5]))
+    ends = [[4, 0, 0.5], [9, 20, 0.5], [1, 0.5, 0.5], [0.5, 0, 3], [0.6, 9, 0.5], [0, 0, 0.5], [2, 0, 0.5]]
+    found = walls.columns(torch.tensor(ends, dtype=torch.float64))
+    assert found.tolist() == [[1, 0], [0, 0], [0, 0], [0, 1], [2, 0], [0, 0], [0, 0]]
+
+
+def test_either_end_of_a_path_may_move():
+    walls = walls_of_file(SceneWalls((WALL,), BOX[:0]), np.zeros(3), None)
+    both = torch.tensor([[0.0, 0, 1, 4, 0, 1], [4, 0, 1, 0, 0, 1], [0, 0, 1, 1, 0, 1]], dtype=torch.float64)
+    assert walls.columns(both)[:, 0].tolist() == [1, 1, 0]
+
+
+def test_a_place_beside_a_long_wall_crosses_it_once_at_most():
+    """As Gaussians walls took the way inside them: a place beside a wall of 28 m was 126 dB too dark."""
+    walls = walls_of_file(SceneWalls((WALL * [1, 5, 1],), BOX[:0]), np.zeros(3), np.array([1.95, -14.0, 1.5]))
+    assert walls.columns(torch.tensor([[2.05, 14.0, 1.5]], dtype=torch.float64)).tolist() == [[1, 0]]

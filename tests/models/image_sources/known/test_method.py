@@ -1,20 +1,15 @@
-"""`init=scene`: against a search on few rows, without walls' ends, and through `train.py`."""
+"""`init=scene`: known walls from few rows, and without walls' ends."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from campaigns import compose
 from closed import fitted_to, read_back
 from rooms import nmse, shoebox
-from shoeboxes import as_arrays
 
-from gsparc.commands.train import train
 from gsparc.data.errors import DataError
-from gsparc.data.own import write_own
 from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.training.context import FitContext
@@ -35,6 +30,11 @@ def fitted(name: str, data, rows: np.ndarray, **init):
     context = FitContext(budget_s=60.0)
     method = CANDIDATES[name](InitSettings(name, searches=1, **init), True, context)
     return method, method.fit(data, Fold(np.sort(rows), rows[:0], rows[:0]), context)
+
+
+def test_a_file_of_walls_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"absent\.yaml: missing; expected a table of `walls`"):
+        read_walls(tmp_path / "absent.yaml")
 
 
 def missed(field, data, rows: np.ndarray) -> float:
@@ -60,35 +60,3 @@ def test_without_visibility_every_image_is_seen_everywhere(room):
     field = CANDIDATES["scene"](settings, False, FitContext())
     fitted_to(field, data, fold.train[:40], budget_s=30.0)
     assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count == 7
-
-
-def walled(folder: Path, kind: str) -> list[str]:
-    """Overrides of a short run over 60 rows of the room with known walls."""
-    told, _, _ = shoebox(60, pillar=True, max_order=1)
-    arrays = as_arrays(told)
-    if kind == "rssi":
-        power = 20 * np.log10(np.abs(arrays.pop("csi")[:, 0, 0]))
-        arrays = {name: arrays[name] for name in ("rx_position", "tx_position")} | {"rssi_db": power}
-    (folder / "room.yaml").write_text(ROOM, encoding="utf-8")
-    write_own(folder / "own.npz", arrays)
-    files = [f"dataset.file='{folder / 'own.npz'}'", f"init.file='{folder / 'room.yaml'}'"]
-    return [
-        "dataset=own", "init=scene", *files,
-        "baselines=[mean]", "logger=none", "threads=1", "budget_s=10", "trainer.max_steps=10",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", ["csi", "rssi"])
-def test_a_run_says_where_it_started(kind, tmp_path):
-    more = ["init.max_sources=12", "init.order=1"] if kind == "csi" else []
-    facts, _ = train(compose(*walled(tmp_path, kind), *more), tmp_path / "run")
-    assert "scene" in str(facts["model/init"]) and facts["time/init_s"] > 0
-    assert facts["test/nmse"] < (0.2 if kind == "csi" else 1.0)
-
-
-def test_what_walls_cannot_serve_is_one_line(tmp_path):
-    run = walled(tmp_path, "csi")
-    with pytest.raises(DataError, match=r"absent\.yaml: missing; expected a table of `walls`"):
-        train(compose(*run, f"init.file={tmp_path / 'absent.yaml'}"), tmp_path / "a")
-    with pytest.raises(ValueError, match=r"init=scene is not possible: model\.effects\.phase=false"):
-        train(compose(*run, "model.effects.phase=false"), tmp_path / "b")
