@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
+from torch.utils.benchmark import Timer
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
@@ -189,3 +190,13 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
         ]
     assert ahead["random"][0] > 0 and ahead["random"][1] > 0
     assert ahead["grouped"][0] > 0.02 and ahead["grouped"][1] > 0.5
+
+
+@pytest.mark.slow
+def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    method = ArrayField()
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
+    batch = data.batch(np.array([0]))
+    timer = Timer("method.predict(batch)", globals={"method": method, "batch": batch})
+    assert timer.blocked_autorange(min_run_time=0.3).median < 1e-3

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from closed import fitted_to, read_back
+from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
@@ -16,6 +17,7 @@ from gsparc.models.powers.waves import field_decibels, fit_wave_weights, plane_w
 from gsparc.ops import Pose
 
 LIGHT, WAVELENGTH = 299_792_458.0, 0.3
+PLANE = REAL / "real" / "techtile-power-reci-rf-1.npz"
 
 
 def plane(count: int, seed: int = 0) -> Measurements:
@@ -136,3 +138,24 @@ def test_a_blend_goes_from_rows_to_groups_to_nothing():
     distance = torch.tensor([0.0, 0.15, 0.3, 1.5, 5.0])
     share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).at(distance, 1.0)
     assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(factor, [0.9, 0.8, 0.7, 0.85, 1.0])
+
+
+@pytest.mark.slow
+def test_a_measured_plane():
+    if not PLANE.exists():
+        pytest.skip(f"{PLANE} is not there")
+    file = np.load(PLANE)
+    loud = np.flatnonzero(file["rssi_db"] > -75)
+    chosen = np.random.default_rng(0).permutation(loud)[:1800]
+    data = from_arrays(
+        {name: file[name][chosen] for name in ("rx_position", "rssi_db")}
+        | {"frequency_hz": file["frequency_hz"]}, {"name": "measured"},
+    )  # fmt: skip
+    square = np.floor(data.moving[:, :2] / 0.3).astype(int) @ [1, 100]
+    test = np.isin(square, np.unique(square)[::5])
+    batch, errors = data.batch(np.flatnonzero(test)), []
+    for fringes in (True, False):
+        field, _ = fitted_to(PowerField(fringes), data, np.flatnonzero(~test))
+        field.condition(data, np.flatnonzero(~test))
+        errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
+    assert errors[0] < errors[1], errors

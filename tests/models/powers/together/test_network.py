@@ -24,6 +24,7 @@ from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
+from gsparc.processes.stored import restored, stored
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -94,6 +95,25 @@ def test_sites_without_azimuths_have_no_pattern(tmp_path):
     assert not any("beams" in note for note in report.notes)
 
 
+RARE = pytest.mark.rare
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=RARE), 1, pytest.param(2, marks=RARE)])
+@pytest.mark.parametrize("count", [pytest.param(3, marks=RARE), 6, pytest.param(10, marks=RARE)])
+@pytest.mark.parametrize(("azimuths", "wrong"), [(True, 0), (True, 2), (False, 0)])
+def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
+    one = network(seed, wrong)
+    method, _ = fitted(one, count, tmp_path, azimuths)
+    found, plain = (
+        judged(one, count, *levels(method, one)),
+        judged(one, count, *reference(one, count, azimuths)),
+    )
+    assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
+    assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), found
+    assert found["best"] > plain["best"] - 0.05, (found, plain)
+
+
 def test_stations_at_places_of_their_own_are_no_network():
     one = network(0)
     data = one.data(6, azimuths=False)
@@ -131,6 +151,13 @@ def places(number: int, *bearings: float) -> torch.Tensor:
     turn = np.radians(bearings)
     at = np.c_[100 * np.sin(turn), 100 * np.cos(turn), 0 * turn]
     return torch.from_numpy(np.c_[at, np.zeros((len(turn), 3)), np.full(len(turn), number)])
+
+
+def test_the_pattern_of_a_sector():
+    trend = sectors()
+    ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
+    assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
+    assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
 
 
 def shadowing() -> Kernel:
@@ -171,3 +198,15 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
     around = Pose(places(0, 0, 90, 180, 270)[:, :3] + 3000, torch.eye(3).expand(4, 3, 3).double())
     said = field.predict(Query(torch.full((4, 3), 3000.0).double(), around)).mean.log10()
     assert float(said.max() - said.min()) < 1e-6
+
+
+def test_sectors_of_a_site_share_shadowing():
+    kernel = shadowing()
+    here, there = places(0, 10.0), places(1, 10.0)
+    assert float(kernel.between(here, here)) == pytest.approx(1.0)
+    assert float(kernel.between(here, there)) == pytest.approx(0.5)
+    both = torch.cat([here, there, places(0, 200.0)])
+    assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
+    for again in (restored(stored(kernel)), kernel.at(kernel.parameters())):
+        assert torch.allclose(again.gram(both), kernel.gram(both))
+        assert again.amplitude == 20
