@@ -1,4 +1,4 @@
-"""`model=array`, spectra of a static array: the Gaussian field through the array under a name of its own."""
+"""`model=array`: spectra that a static array measures, imaged from Gaussians by the array's response."""
 
 from __future__ import annotations
 
